@@ -83,17 +83,34 @@ def test_without_odometry_nothing_is_begun_from_rest():
     assert flight.state is State.ATTACHED and "refused: no usable odometry" in flight.said
 
 
-@pytest.mark.parametrize("delay, before, room", [(0.03, 0.25, 0.03), (0.03, 0.45, 0.03), (0.04, 0.25, 0.03), (0.04, 0.45, 0.0)])
-def test_a_landing_before_a_surface_stops_there_first(delay, before, room):
-    """The plan for `contact_delay` 0.04 s is faster at the wall; ordered 0.45 s before it, the stop has 3 mm left."""
+@pytest.mark.parametrize("command", [Command.LAND, Command.HOVER])
+@pytest.mark.parametrize("delay, before, room", [(0.03, 0.25, 0.03), (0.03, 0.45, 0.14), (0.04, 0.25, 0.03), (0.04, 0.35, 0.04), (0.04, 0.45, 0.14),
+                                                 (0.04, 0.55, 0.14)])
+def test_a_stop_before_a_surface_keeps_the_room_that_the_body_needs(delay, before, room, command):
+    """A brake stops a body radius (0.15 m) before the contact's place as long as 8 m/s^2 are enough for it; from 0.45 s before on they are not."""
     plan, loop = perch("surface_90_1.7m", PerchSettings(contact_delay=delay)), make_loop()
     loop.begin_in_hover()
     loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
     loop.run(0.04 + plan.trajectory.duration - before)
-    loop.controller.command(Command.LAND)
+    loop.controller.command(command)
     nearest = []
-    landed = loop.run(5.5, until=lambda x: nearest.append((x.plant.p - plan.contact) @ plan.normal) or x.controller.state is State.DISARMED)
-    assert landed and min(nearest) > room and loop.plant.impact_speed < 1.0
+    ended = State.DISARMED if command is Command.LAND else State.HOVERING
+    loop.run(5.5, until=lambda x: nearest.append((x.plant.p - plan.contact) @ plan.normal) or x.controller.state is State.DISARMED)
+    assert loop.controller.state is ended and min(nearest) > room and loop.plant.impact_speed < 1.0
+
+
+def test_a_landing_leaves_a_trajectory_by_its_planned_way_out():
+    loop, start = leaving()
+    ready(loop, start, start + 0.6)
+    loop.run(0.3)
+    loop.controller.command(Command.LAND, "low battery")
+    assert loop.controller.state is State.TRACKING and "low battery; planned recovery in" in loop.controller.flown.message
+    with pytest.raises(TrajectoryRefused, match="about to be left"):
+        loop.follow(perch("surface_90_1.7m").trajectory, AtEnd.CONTACT, id=9)
+    loop.run(0.4)
+    assert loop.controller.state is State.RECOVERING
+    loop.run(8.0, until=lambda x: x.controller.state is State.DISARMED)
+    assert loop.controller.state is State.DISARMED and loop.plant.impact_speed < 1.0
 
 
 def test_a_hover_at_the_ground_is_a_landing():

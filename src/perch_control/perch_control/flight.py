@@ -136,13 +136,14 @@ class FlightController:
 
     def _land(self, x: FlightState, why: str) -> FlightState:
         _check_flying(x, "land")
-        return brought_down(x, f"landing{why}", self.settings.land_speed)
+        way_out = self._schedule.leave(x, f"landing{why}") if x.mode is State.TRACKING else None
+        return brought_down(x, f"landing{why}", self.settings.land_speed) if way_out is None else way_out._replace(lands=True)
 
     def _hover(self, x: FlightState, why: str) -> FlightState:
         _check_flying(x, "hover")
         if x.mode is State.RECOVERING:  # it ends in a hover, and must not be cut short
-            return x
-        return self._left(x, f"hover{why}")
+            return x._replace(lands=False)
+        return self._left(x._replace(lands=False), f"hover{why}")
 
     def _arm(self, x: FlightState, why: str) -> FlightState:
         if x.mode is State.ARMED or x.flying:
@@ -171,8 +172,8 @@ class FlightController:
         x = self.flown
         if self.odometry_age > self.settings.odometry_timeout:
             raise TrajectoryRefused("no usable odometry")
-        if self._schedule.leaving:
-            raise TrajectoryRefused("what is flown is about to be left by a planned way out")
+        if self._schedule.leaving or x.lands:
+            raise TrajectoryRefused("what is flown is about to be left")
         if x.mode is State.ATTACHED:
             x = self.flown = self._thrust.reset(x, self.law, self.compensator)
         elif x.mode not in (State.ARMED, State.TRACKING, State.HOVERING):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from math import dist, inf
+from math import dist, inf, sqrt
 from typing import NamedTuple
 
 from perch_core.vector3 import axpy, dot, norm, scale
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.admission import AtEnd, Order
 from perch_control.descent import BlindDescent
-from perch_control.guidance import BRAKE_PEAK, Hold
+from perch_control.guidance import BRAKE_HARD, BRAKE_PEAK, Hold
 from perch_control.inner_loop import InnerLoopEstimate, stopped
 from perch_control.modes import FLYING, State
 from perch_control.reference import Setpoint, Source
@@ -34,6 +34,7 @@ class FlightState(NamedTuple):
         attached_to: normal of the surface that carries the vehicle, None: none does.
         blind: the descent without position that is under way.
         ground: height at which the vehicle was armed [m]; `airborne`: it has been clear of it since.
+        lands: a landing follows what is flown, not a hover.
         events: what has happened since the last step.
         now: time of the step [s].
         belief: state that is flown on, 13 floats: odometry, or its prediction while odometry is refused.
@@ -56,6 +57,7 @@ class FlightState(NamedTuple):
     blind: BlindDescent | None
     ground: float
     airborne: bool
+    lands: bool
     events: tuple[str, ...]
     # the last seven change in each step
     now: float
@@ -69,7 +71,7 @@ class FlightState(NamedTuple):
     @classmethod
     def disarmed(cls, vehicle: Vehicle) -> FlightState:
         """A vehicle of which nothing is known but its file."""
-        return cls(vehicle, False, State.DISARMED, "disarmed", Hold(Setpoint((0.0, 0.0, 0.0))), 0.0, None, 0, None, None, None, -inf, False, (),
+        return cls(vehicle, False, State.DISARMED, "disarmed", Hold(Setpoint((0.0, 0.0, 0.0))), 0.0, None, 0, None, None, None, -inf, False, False, (),
                    0.0, (), (0.0, ()), stopped(vehicle), 1.0, 1.0, 0.0)
 
     def sensed(self, now: float, belief: tuple[float, ...], seen: tuple[float, tuple[float, ...]],
@@ -131,15 +133,19 @@ class FlightState(NamedTuple):
         return dist(self.meeting[1], self.belief[0:3]) < _AWAY * max(self.vehicle.body_radii)
 
     @property
-    def needed_deceleration(self) -> float:
-        """What it takes to stop before the surface that the trajectory leads to [m/s^2], 0 in the open."""
+    def stopping(self) -> tuple[float, bool]:
+        """Longest duration T of a brake that ends before the surface that the trajectory leads to [s], infinite in the open; and whether
+        the hardest brake still does: v T / 2 + a T^2 / 10 is the room, with speed v and acceleration a towards the surface."""
         order = self.order
         if order is None or order.at_end is not AtEnd.CONTACT:
-            return 0.0
+            return inf, True
         now, normal = self.setpoint(), _normal_at_end(order)
         room = dot(axpy(-1.0, order.source.setpoint(order.source.duration).p, now.p), normal) - max(self.vehicle.body_radii)
-        closing = max(-dot(now.v, normal), 0.0)
-        return BRAKE_PEAK * closing**2 / (2.0 * max(room, 1e-3))
+        v, a = -dot(now.v, normal), max(-dot(now.a, normal), 0.0)
+        if v <= 0.0:
+            return inf, True
+        longest, hardest = 4.0 * max(room, 0.0) / (v + sqrt(v**2 + 1.6 * a * max(room, 0.0))), BRAKE_PEAK * v / BRAKE_HARD
+        return max(longest, hardest), longest >= hardest
 
     @property
     def surface_normal(self) -> tuple[float, ...] | None:

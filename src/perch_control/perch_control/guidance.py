@@ -6,6 +6,7 @@ Each has `duration` [s] and `setpoint(t)`; past their duration they hold their e
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from operator import add
 
 import numpy as np
@@ -17,6 +18,8 @@ from perch_core.trajectory import FlatTrajectory
 LONG = 0.5   # a takeover takes so long, where there is twice as much time [s]
 SHORT = 0.3  # a takeover shorter than this asks for more than the vehicle can follow: it uses what time there is [s]
 BRAKE_PEAK = 1.875  # peak of the derivative of the quintic 0 -> 1 step, per its duration
+BRAKE_HARD = 8.0    # largest deceleration of a brake, where the trajectory leads to a surface [m/s^2]
+_BRAKE = 4.0        # the same in the open: leans by 22 deg at most [m/s^2]
 
 
 @dataclass(frozen=True)
@@ -90,20 +93,19 @@ def _moving_on_at(tables, edges, durations, choose, t, h):
     return fields(out[0])
 
 
-def brake(p, v, a, h, v_end=(0.0, 0.0, 0.0), deceleration: float = 4.0) -> Polynomial:
+def brake(p, v, a, h, v_end=(0.0, 0.0, 0.0), within: float = inf) -> Polynomial:
     """Smooth change of velocity from a moving state to `v_end`, position left free at the end.
 
-    The velocity is a quintic with zero end acceleration and jerk; the duration keeps the mean of its peak at
-    `deceleration`.
+    The velocity is a quintic with zero end acceleration and jerk; the way covered is v T / 2 + a T^2 / 10.
 
     Args:
         p, v, a: where the motion is taken over [m, m/s, m/s^2], shape (3,).
         h: wanted direction of b2; made horizontal.
         v_end: velocity at the end [m/s].
-        deceleration: [m/s^2].
+        within: longest duration T [s]; shorter is what is gentle in the open.
     """
     p, v, a, v_end = (np.array(x, float) for x in (p, v, a, v_end))
-    T = max(0.4, BRAKE_PEAK * float(np.linalg.norm(v - v_end)) / deceleration, float(np.linalg.norm(a)) / deceleration * 0.4)
+    T = min(max(0.4, BRAKE_PEAK * float(np.linalg.norm(v - v_end)) / _BRAKE, 0.4 * float(np.linalg.norm(a)) / _BRAKE), within)
     velocity = np.stack([v, v + a * T / 5, v + 2 * a * T / 5, v_end, v_end, v_end], axis=-1)
     steps = np.cumsum(velocity, axis=-1) * T / 6
     return Polynomial(p[:, None] + np.concatenate([np.zeros((3, 1)), steps], axis=-1), T, horizontal(h))

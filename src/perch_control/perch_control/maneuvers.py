@@ -32,8 +32,6 @@ from perch_control.recovery import Recovery
 from perch_control.reference import Setpoint, Source
 from perch_control.weak_landing import WeakLanding
 
-BRAKE_HARD = 8.0      # largest deceleration of a brake, where the trajectory leads to a surface [m/s^2]
-_BRAKE = 4.0          # the same in the open: leans by 22 deg at most [m/s^2]
 _FOLLOWED = 0.3       # nearer to the reference than this, a manoeuvre continues the reference, not the state [m]
 _LEVEL = 0.8          # cosine of the tilt up to which a brake starts from the attitude as it is
 _TURNING = 4.0        # the same for the body rate [rad/s]
@@ -43,6 +41,7 @@ _ZERO = (0.0, 0.0, 0.0)
 def entered(x: FlightState, mode: State, message: str) -> FlightState:
     """Another mode, and why. A trajectory is kept while it is tracked, the place that it meets on the recovery from there, too."""
     return x._replace(mode=mode, message=message, events=(*x.events, message), order=x.order if mode is State.TRACKING else None,
+                      lands=x.lands and mode in (State.TRACKING, State.RECOVERING),
                       meeting=x.meeting if mode in (State.TRACKING, State.RECOVERING) else None)
 
 
@@ -79,7 +78,7 @@ def stopped(x: FlightState, message: str) -> FlightState:
     if turning or x.surface_normal or reference_tilt_deg(x.belief, setpoint) > TILT_MARGIN:
         return recovered(x, message)
     p, v, a = _point_of_departure(x, setpoint)
-    return following(entered(x, State.HOVERING, message), brake(p, v, a, setpoint.h, deceleration=_deceleration(x)))
+    return following(entered(x, State.HOVERING, message), brake(p, v, a, setpoint.h, within=x.stopping[0]))
 
 
 def stayed(x: FlightState, message: str) -> FlightState:
@@ -102,18 +101,13 @@ def landing(x: FlightState, message: str, speed: float) -> FlightState:
     """Descend with a speed [m/s] until the ground is felt."""
     setpoint = x.setpoint()
     p, v, a = _point_of_departure(x, setpoint)
-    return following(entered(x, State.LANDING, message), brake(p, v, a, setpoint.h, (0.0, 0.0, -speed), _deceleration(x)))
+    return following(entered(x, State.LANDING, message), brake(p, v, a, setpoint.h, (0.0, 0.0, -speed), x.stopping[0]))
 
 
 def brought_down(x: FlightState, message: str, speed: float) -> FlightState:
     """Land with a speed [m/s]; where a hover would begin with a recovery, after that."""
-    if x.mode is State.LANDING:
-        return landing(x, message, speed)
-    after = x if isinstance(x.source, Recovery) else stopped(x, message)
-    if not isinstance(after.source, Recovery):
-        return landing(x, message, speed)
-    after.source.lands = True
-    return after._replace(message=message)
+    after = x if x.mode in (State.LANDING, State.RECOVERING) else stopped(x, message)
+    return after._replace(message=message, lands=True) if after.mode is State.RECOVERING else landing(x, message, speed)
 
 
 def landing_weak(x: FlightState, message: str, speed: float) -> FlightState:
@@ -141,11 +135,6 @@ def descending(x: FlightState, message: str, vehicle: Vehicle, gains: ControlGai
     for sample in unseen:
         blind.imu(*sample)
     return entered(x, State.LANDING, f"descent without position: {message}")._replace(blind=blind)
-
-
-def _deceleration(x: FlightState) -> float:
-    """Of a brake [m/s^2]: gentle in the open, before a surface as hard as is needed."""
-    return max(_BRAKE, min(x.needed_deceleration, BRAKE_HARD))
 
 
 def _point_of_departure(x: FlightState, setpoint: Setpoint) -> tuple:

@@ -46,7 +46,6 @@ class Recovery(ByState):
 
     Attributes:
         finished: the vehicle is upright and slow, and away from the surface.
-        lands: a landing follows, not a hover.
     """
 
     def __init__(self, specific_thrust_max: float, state: tuple[float, ...], normal: Vector | None) -> None:
@@ -61,7 +60,7 @@ class Recovery(ByState):
         self._push = None if normal is None or normal[2] >= cos(radians(30.0)) else normal
         _, self._h, _ = axes_of(state[6:10])
         self._setpoint = Setpoint(state[0:3], state[3:6], h=self._h)
-        self.finished = self.lands = False
+        self.finished = False
 
     def update(self, state: tuple[float, ...], elapsed: float) -> None:
         """Take the present state, `elapsed` seconds after the beginning."""

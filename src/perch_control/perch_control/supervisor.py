@@ -10,7 +10,7 @@ from perch_control.admission import AtEnd, Order
 from perch_control.debounce import Debounce
 from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
-from perch_control.maneuvers import BRAKE_HARD, landing, landing_weak, motors_off, recovered, settled, stopped
+from perch_control.maneuvers import landing, landing_weak, motors_off, recovered, settled, stopped
 from perch_control.modes import State
 from perch_control.monitors import CarriedTilted, TrackingMonitor
 from perch_control.recovery import TIMEOUT, Recovery
@@ -28,7 +28,7 @@ _UPRIGHT = 0.7       # cosine of the tilt beyond which a recovery or a perch goe
 
 def committed(x: FlightState) -> bool:
     """Even the hardest brake would end in the surface that the trajectory leads to: contact is the shorter way to rest."""
-    return x.needed_deceleration > BRAKE_HARD
+    return not x.stopping[1]
 
 
 class Supervisor:
@@ -94,7 +94,7 @@ class Supervisor:
             return self._on_reference(x)  # a planned way out
         source.update(x.belief, x.elapsed)
         if source.finished:
-            if source.lands:
+            if x.lands:
                 return landing(x, "landing after the recovery", self.settings.land_speed)
             if x.low:
                 return landing(x, "landing: the recovery ended at the ground", self.settings.land_speed)
@@ -131,6 +131,8 @@ class Supervisor:
         elif over >= 0.0:
             if order.at_end is AtEnd.LAND:
                 return landing(x, f"landing after trajectory {order.id}", self.settings.land_speed)
+            if x.lands:
+                return landing(x, "landing after the way out", self.settings.land_speed)
             return stopped(x, f"hovering at the end of trajectory {order.id}")
         return x
 
