@@ -58,5 +58,5 @@ def perch_certificates(search: Search, outcome: Outcome) -> tuple[Certificate, .
     least, most, question = search.settings.impact_speed_min, search.settings.impact_speed_max, search.question
     speed, end = _impact(outcome.coefficients, outcome.durations, question.v_S, question.s3)
     impact = Certificate(quantity="impact_speed", unit="m/s", lower_limit=least, upper_limit=most, minimum=speed, maximum=speed,
-                         time_of_minimum=end, time_of_maximum=end, method="bernstein", holds=least - INSET <= speed <= most + INSET)
+                         time_of_minimum=end, time_of_maximum=end, method="bernstein", holds=bool(least - INSET <= speed <= most + INSET))
     return (*certificates(outcome.results, search.limits, search.vehicle.mass), impact)

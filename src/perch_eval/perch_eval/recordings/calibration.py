@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +68,10 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
         "cameras": {}
     }
     imu = root / "imu0" / "sensor.yaml"
-    T_BI = in_body(imu)
+    content = _mapping(imu) if imu.is_file() else {}
+    T_BI = _in_body(imu, content)
     if imu.is_file():
-        out["imu"] = _imu(str(imu), _mapping(imu), R_BI)
+        out["imu"] = _imu(str(imu), content, R_BI)
     for file in sorted(root.glob("cam*/sensor.yaml")):
         c, source = _mapping(file), str(file)
         T_IC = np.linalg.inv(T_BI) @ _transform(source, "T_BS", _needed(source, c, "T_BS"))
@@ -85,7 +87,10 @@ def in_body(file: Path) -> np.ndarray:
     Raises:
         ConfigError: it cannot be read, or is no rigid transform.
     """
-    content = _mapping(file) if file.is_file() else {}
+    return _in_body(file, _mapping(file) if file.is_file() else {})
+
+
+def _in_body(file: Path, content: Mapping[str, Any]) -> np.ndarray:
     return _transform(str(file), "T_BS", content.get("T_BS", np.eye(4).tolist()))
 
 

@@ -258,8 +258,7 @@ class VisualInertialOdometry:
         self._views.append((exposed, features))
         while len(self._views) > 1 and self._views[1][0] <= state.stamp:
             self._views.popleft()
-        result = self._result(FrameOutcome.RESTING, features, FrameReport())
-        return replace(result, blind_for=0.0, estimate=_estimate(rest.moved_on(filter, self._imu.run(until, exposed), exposed, shaken)))
+        return self._result(FrameOutcome.RESTING, features, FrameReport(), rest.moved_on(filter, self._imu.run(until, exposed), exposed, shaken))
 
     def _stand_on(self, floor: float, features: Features) -> None:
         """What was seen of the ground while the vehicle stood, and still is, becomes its first landmarks."""
@@ -314,8 +313,9 @@ class VisualInertialOdometry:
             self._known = KnownPose(s.p_WB.copy(), s.R_WB.copy(), _estimate(s).pose_covariance[rows])
             self._biases = _biases(s)
 
-    def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport) -> VioResult:
-        s = self._running.state
+    def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport, now: at.State | None = None) -> VioResult:
+        """What became of a frame; `now`: the state at its exposure, None: the filter's."""
+        s = self._running.state if now is None else now
         return VioResult(outcome, _estimate(s) if outcome.has_pose else None, len(features.ids), report.used, report.refused,
                          report.nis, report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
 
