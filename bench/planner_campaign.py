@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from random_perches import random_problem, requirements, shipped_settings
+from random_perches import random_problem, shipped_settings
 
 from perch_core import config
 from perch_core.vehicle import load_vehicle
@@ -28,6 +28,7 @@ from perch_eval.revision import made_of
 from perch_planner.planner import plan
 from perch_planner.problem import PerchSettings
 from perch_planner.refusals import PerchRefusal
+from perch_planner.plan_output import requirements
 from perch_planner.verifier import verify
 
 

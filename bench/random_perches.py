@@ -1,4 +1,4 @@
-"""Random perching problems and the requirements that the independent verifier checks them against."""
+"""Random perching problems."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ import numpy as np
 
 from perch_core import config
 from perch_core.surface import PerchSurface
-from perch_core.vehicle import Vehicle
 from perch_eval.node_launch import read_parameters
-from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP
-from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint
-from perch_planner.verifier import Requirements, Rotors
+from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
 
 
 def shipped_settings() -> PerchSettings:
@@ -40,22 +37,6 @@ def random_problem(rng: np.random.Generator) -> PerchProblem:
     points = [p0 + s * (p_WS + 0.2 * surface.normal - p0) + rng.normal(0.0, 0.04 * distance / (1 + 0.3 * count), 3) for s in share]
     velocity = rng.normal(0.0, 0.6, 3) * (1.0, 1.0, 0.2) if rng.random() < 0.25 and not count else np.zeros(3)
     return PerchProblem(start, surface, tuple(Waypoint(p) for p in points), velocity)
-
-
-def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Requirements:
-    """What was asked, in the plain numbers of the verifier."""
-    limits, start, surface = Limits.of(settings, vehicle), problem.start, problem.surface
-    each = Rotors(np.array(vehicle.inertia), vehicle.allocation, limits.rotor_thrust)
-    return Requirements(
-        start=np.array([start.p, start.v, start.a, start.j]), start_yaw=(start.yaw, start.yaw_rate),
-        waypoints=np.array([w.p for w in problem.waypoints]).reshape(-1, 3), p_S=surface.p_WS, s1=surface.R_WS[:, 0],
-        s2=surface.R_WS[:, 1], s3=surface.normal, v_S=problem.target_velocity, perch_offset=vehicle.perch_offset,
-        mass=vehicle.mass, impact_acceleration=settings.impact_acceleration,
-        impact_speed=(settings.impact_speed_min, settings.impact_speed_max), tangential_speed=settings.tangential_speed_max,
-        contact_delay=settings.contact_delay,
-        tube=(settings.tube_time, TUBE_STEP, TUBE_SHARE, TUBE_FLOOR), thrust=limits.thrust,
-        body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension,
-        rotors=each)
 
 
 def paper_like_problem(rng: np.random.Generator, waypoints: int) -> PerchProblem:

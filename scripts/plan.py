@@ -16,7 +16,8 @@ EXAMPLES = """examples:
   python3 scripts/plan.py --list                           the problems there are
 
 files: plan.csv, plan.json (coefficients or figures, certificates), plan.png; powerline: visibility.png, plan.gif
-exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or file"""
+exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or file, 3 the independent verifier refuses the plan"""
+FOUND_BROKEN = 3
 
 
 def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
@@ -24,6 +25,7 @@ def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
     from perch_planner.planner import plan
     from perch_planner.problem import Limits
     from perch_planner.problem_file import read_problem
+    from perch_planner.verifier import verify
 
     problem, settings, vehicle = read_problem(mapping, source)
     plan(problem, settings, vehicle)  # loads the compiled kernels: the second plan is timed
@@ -35,7 +37,12 @@ def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
     print(f"contact after {planned.duration:.3f} s; {planned.iterations} programs in {1e3 * planned.solve_time:.2f} ms")
     for certificate in planned.certificates:
         print(f"  {certificate}")
-    return 0
+    broken = verify(planned.trajectory.durations, planned.trajectory.coefficients, plan_output.requirements(problem, settings, vehicle))
+    for finding in broken:
+        print(f"the verifier refuses it: {finding.requirement} broken by {finding.excess:.3g} at {finding.time:.3f} s", file=sys.stderr)
+    if not broken:
+        print("the independent verifier finds nothing broken")
+    return FOUND_BROKEN if broken else 0
 
 
 def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool) -> int:

@@ -14,8 +14,9 @@ from perch_planner import refusals, relaxation, search, solvers
 from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint, contact_heading
 from perch_planner.refusals import PerchRefusal
+from perch_planner.plan_output import requirements
 from perch_planner.verifier import verify
-from random_perches import random_problem, requirements, shipped_settings
+from random_perches import random_problem, shipped_settings
 
 VEHICLE = load_vehicle("snapdragon")
 HOVER = StartState((0.0, 0.0, 1.5))

@@ -15,8 +15,8 @@ from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
 from perch_planner.planner import plan
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
+from perch_planner.plan_output import requirements
 from perch_planner.verifier import verify
-from random_perches import requirements
 
 ROOT = Path(__file__).resolve().parents[2]
 
