@@ -28,7 +28,7 @@ BLIND_AFTER = 0.08                # without odometry for so long, the IMU is ans
 LONGEST_PLAN = 60.0               # a way out that starts later is none out of what is flown [s]
 STALE = NANOSECONDS               # a command or an estimator's status that is older is of another time [ns]
 GONE = NANOSECONDS                # after so long without any input, a source that begins anew is believed in flight, too [ns]
-_FIXED = ("vehicle", "sensors")     # parameters that do not change after the start
+_FIXED = ("vehicle", "sensors")   # parameters that do not change after the start
 _WORDS = 200                      # characters of a reason that are passed on
 
 

@@ -9,7 +9,7 @@ from perch_core.vector3 import axpy, dot, norm, scale
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.admission import AtEnd, Order
 from perch_control.descent import BlindDescent
-from perch_control.guidance import BRAKE_HARD, BRAKE_PEAK, Hold
+from perch_control.guidance import BRAKE_PEAK, Hold
 from perch_control.inner_loop import InnerLoopEstimate, stopped
 from perch_control.modes import FLYING, State
 from perch_control.reference import Setpoint, Source
@@ -133,19 +133,19 @@ class FlightState(NamedTuple):
         return dist(self.meeting[1], self.belief[0:3]) < _AWAY * max(self.vehicle.body_radii)
 
     @property
-    def stopping(self) -> tuple[float, bool]:
-        """Longest duration T of a brake that ends before the surface that the trajectory leads to [s], infinite in the open; and whether
-        the hardest brake still does: v T / 2 + a T^2 / 10 is the room, with speed v and acceleration a towards the surface."""
+    def stopping(self) -> tuple[float, float]:
+        """Longest duration T of a brake that ends before the surface that the trajectory leads to [s], infinite in the open; and the
+        deceleration [m/s^2]. v T / 2 + a T^2 / 10 is the room, with speed v and acceleration a towards the surface."""
         order = self.order
         if order is None or order.at_end is not AtEnd.CONTACT:
-            return inf, True
+            return inf, 0.0
         now, normal = self.setpoint(), _normal_at_end(order)
-        room = dot(axpy(-1.0, order.source.setpoint(order.source.duration).p, now.p), normal) - max(self.vehicle.body_radii)
+        room = max(dot(axpy(-1.0, order.source.setpoint(order.source.duration).p, now.p), normal) - max(self.vehicle.body_radii), 1e-3)
         v, a = -dot(now.v, normal), max(-dot(now.a, normal), 0.0)
         if v <= 0.0:
-            return inf, True
-        longest, hardest = 4.0 * max(room, 0.0) / (v + sqrt(v**2 + 1.6 * a * max(room, 0.0))), BRAKE_PEAK * v / BRAKE_HARD
-        return max(longest, hardest), longest >= hardest
+            return inf, 0.0
+        longest = 4.0 * room / (v + sqrt(v**2 + 1.6 * a * room))
+        return longest, BRAKE_PEAK * v / longest
 
     @property
     def surface_normal(self) -> tuple[float, ...] | None:

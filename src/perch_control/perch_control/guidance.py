@@ -102,10 +102,13 @@ def brake(p, v, a, h, v_end=(0.0, 0.0, 0.0), within: float = inf) -> Polynomial:
         p, v, a: where the motion is taken over [m, m/s, m/s^2], shape (3,).
         h: wanted direction of b2; made horizontal.
         v_end: velocity at the end [m/s].
-        within: longest duration T [s]; shorter is what is gentle in the open.
+        within: longest duration T [s]: gentle where this is long, at most with `BRAKE_HARD` horizontally and vertically where it is short.
     """
     p, v, a, v_end = (np.array(x, float) for x in (p, v, a, v_end))
-    T = min(max(0.4, BRAKE_PEAK * float(np.linalg.norm(v - v_end)) / _BRAKE, 0.4 * float(np.linalg.norm(a)) / _BRAKE), within)
+    change = v - v_end
+    gentle = max(0.4, BRAKE_PEAK * float(np.linalg.norm(change)) / _BRAKE, 0.4 * float(np.linalg.norm(a)) / _BRAKE)
+    hardest = BRAKE_PEAK * max(float(np.linalg.norm(change[:2])), abs(float(change[2])), 0.1) / BRAKE_HARD
+    T = min(gentle, max(within, hardest))
     velocity = np.stack([v, v + a * T / 5, v + 2 * a * T / 5, v_end, v_end, v_end], axis=-1)
     steps = np.cumsum(velocity, axis=-1) * T / 6
     return Polynomial(p[:, None] + np.concatenate([np.zeros((3, 1)), steps], axis=-1), T, horizontal(h))

@@ -10,6 +10,7 @@ from perch_control.admission import AtEnd, Order
 from perch_control.debounce import Debounce
 from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
+from perch_control.guidance import BRAKE_HARD
 from perch_control.maneuvers import landing, landing_weak, motors_off, recovered, settled, stopped
 from perch_control.modes import State
 from perch_control.monitors import CarriedTilted, TrackingMonitor
@@ -28,7 +29,7 @@ _UPRIGHT = 0.7       # cosine of the tilt beyond which a recovery or a perch goe
 
 def committed(x: FlightState) -> bool:
     """Even the hardest brake would end in the surface that the trajectory leads to: contact is the shorter way to rest."""
-    return not x.stopping[1]
+    return x.stopping[1] > BRAKE_HARD
 
 
 class Supervisor:
