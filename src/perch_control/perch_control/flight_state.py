@@ -34,7 +34,7 @@ class FlightState(NamedTuple):
         attached_to: normal of the surface that carries the vehicle, None: none does.
         blind: the descent without position that is under way.
         ground: height at which the vehicle was armed [m]; `airborne`: it has been clear of it since.
-        lands: a landing follows what is flown, not a hover.
+        lands: it was ordered to land: a hover becomes a landing.
         events: what has happened since the last step.
         now: time of the step [s].
         belief: state that is flown on, 13 floats: odometry, or its prediction while odometry is refused.

@@ -41,7 +41,7 @@ _ZERO = (0.0, 0.0, 0.0)
 def entered(x: FlightState, mode: State, message: str) -> FlightState:
     """Another mode, and why. A trajectory is kept while it is tracked, the place that it meets on the recovery from there, too."""
     return x._replace(mode=mode, message=message, events=(*x.events, message), order=x.order if mode is State.TRACKING else None,
-                      lands=x.lands and mode in (State.TRACKING, State.RECOVERING),
+                      lands=x.lands and mode in (State.TRACKING, State.RECOVERING, State.HOVERING),
                       meeting=x.meeting if mode in (State.TRACKING, State.RECOVERING) else None)
 
 

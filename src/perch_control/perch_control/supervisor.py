@@ -89,14 +89,15 @@ class Supervisor:
             x.source.update(x.belief, x.specific_thrust_max)
         return x
 
+    def _hovering(self, x: FlightState) -> FlightState:
+        return landing(x, "landing, as was ordered", self.settings.land_speed) if x.lands else self._on_reference(x)
+
     def _recovering(self, x: FlightState) -> FlightState:
         source = x.source
         if not isinstance(source, Recovery):
             return self._on_reference(x)  # a planned way out
         source.update(x.belief, x.elapsed)
         if source.finished:
-            if x.lands:
-                return landing(x, "landing after the recovery", self.settings.land_speed)
             if x.low:
                 return landing(x, "landing: the recovery ended at the ground", self.settings.land_speed)
             return settled(x, "recovered: hovering")
@@ -132,8 +133,6 @@ class Supervisor:
         elif over >= 0.0:
             if order.at_end is AtEnd.LAND:
                 return landing(x, f"landing after trajectory {order.id}", self.settings.land_speed)
-            if x.lands:
-                return landing(x, "landing after the way out", self.settings.land_speed)
             return stopped(x, f"hovering at the end of trajectory {order.id}")
         return x
 
@@ -165,7 +164,7 @@ class Supervisor:
 
 WATCH: dict[State, Callable[[Supervisor, FlightState], FlightState]] = {
     State.TRACKING: Supervisor._on_reference,
-    State.HOVERING: Supervisor._on_reference,
+    State.HOVERING: Supervisor._hovering,
     State.RECOVERING: Supervisor._recovering,
     State.LANDING: Supervisor._landing,
 }
