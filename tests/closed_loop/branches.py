@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 import traceback
@@ -20,6 +21,7 @@ def branched(way: Callable[[], Found]) -> Found:
     reads, writes = os.pipe()
     pid = os.fork()
     if pid == 0:
+        gc.freeze()  # garbage of this process may belong to threads that are not there in the child: collecting it there crashes
         with os.fdopen(writes, "wb") as out:
             try:
                 answer: tuple[bool, object] = (True, way())
