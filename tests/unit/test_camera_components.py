@@ -254,7 +254,7 @@ def test_the_mapper_works_in_grey_where_wires_are_dark():
     for ms in range(0, 200, 2):
         component.on_odometry(odometry(ms * MS))
     component.on_image(picture(100 * MS, load_vehicle("rpg").mounts["front"].camera, "mono8"))
-    assert out["powerlines"][0].message.startswith(("", "no"))
+    assert out["powerlines"][0].message == ""
     assert out.warnings() == []
 
 

@@ -151,6 +151,8 @@ def test_a_slow_landing_of_strong_rotors_ends_on_the_ground():
     flight.order(Command.LAND)
     flight.step(2.0)
     assert flight.state is State.LANDING and 0.1 < height - flight.plant.p[2] < 0.3
+    flight.step(8.0)
+    assert flight.state is State.DISARMED and flight.plant.p[2] < 0.01
 
 
 @pytest.mark.parametrize("stream", ["on_imu", "on_odometry"])

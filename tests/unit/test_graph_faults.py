@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from perch_core.errors import PerchError
@@ -137,11 +138,12 @@ def test_the_page_says_whether_its_rows_are_of_this_code(monkeypatch, code, olde
     assert ("older than the code" in campaign.page([row(code=code)])) == older
 
 
-def test_a_goal_whose_mission_is_gone_is_followed_until_the_fault_has_had_its_time_to_be_named():
+def test_a_goal_whose_mission_is_gone_is_followed_until_the_fault_has_had_its_time_to_be_named(monkeypatch):
+    monkeypatch.setattr("perch_eval.graph_faults.flight.time", SimpleNamespace(time=lambda: 1000.0))
     for case, after, followed in ((CASE._replace(node="mission"), 5.0, True), (CASE._replace(node="mission"), 6.0, False),
                                   (CASE._replace(node="mission", fault="restart"), 60.0, True), (CASE, 60.0, True)):
         director = _Director(case, None, None, 1.2, None)
-        director.struck = time.time() - after
+        director.struck = 1000.0 - after
         with nullcontext() if followed else pytest.raises(PerchError, match=UNANSWERED):
             director.follow()
 

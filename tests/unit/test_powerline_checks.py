@@ -115,7 +115,8 @@ def test_perch_guess_joins_start_and_pose(s3: list[float]) -> None:
     np.testing.assert_allclose(so3.quat_to_matrix(states[-1, 3:7])[:, 2], s3, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(states[:, 3:7], axis=1), 1)
     b3 = so3.quat_to_matrix(states[:, 3:7])[:, :, 2]
-    assert b3[:, 0].min() > -1e-9 if s3[0] > 0 else True
+    if s3[0] > 0:
+        assert b3[:, 0].min() > -1e-9
     if s3[2] == -1.0:  # braking: it turns over backwards, away from the line
         assert b3[20, 0] < -0.1
 

@@ -209,7 +209,9 @@ def test_nodes_and_executables(nodes):
 
 
 def test_the_parameter_that_is_changed_exists(nodes):
-    for command in (c for c in COMMANDS if "param.py set" in c):
+    commands = [c for c in COMMANDS if "param.py set" in c]
+    assert commands
+    for command in commands:
         _, _, _, node, name, value = shlex.split(command)
         node = nodes[node.strip("/")]
         before, value = node.get_parameter(name).value, yaml.safe_load(value)
