@@ -181,7 +181,9 @@ class Rig:
             result: FlightResult | PerchError = self.pilot.fly(scenario or self.scenario, hear, go_on, PATIENCE)
         except PerchError as error:
             result = error
+        end = time.monotonic() + PATIENCE
         while not state["over"]:  # what is still to be done after the goal's end
+            assert time.monotonic() < end, f"what was to be done does not end, after {result}\n" + "\n".join(self._lines[-30:])
             if isinstance(state["waits"], str):
                 state["waits"] = None
             go_on()

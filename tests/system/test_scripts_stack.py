@@ -84,16 +84,15 @@ def test_ready_then_stopped_without_leftovers(start, tmp_path, composed, number)
     assert (process.returncode, error) == (0, "") and out.endswith("stopped\n")
     assert not any(child.is_running() for child in started.values())
     assert {file.name for file in tmp_path.glob("*.yaml")} == {f"{node}.yaml" for node in (NODES if composed else (*NODES, "viewer"))}
-    logs = "".join(file.read_text() for file in tmp_path.glob("*.log"))
-    assert "Traceback" not in logs
+    logs = {file.stem: file.read_text() for file in tmp_path.glob("*.log")}
+    assert set(logs) == set(started) and "Traceback" not in "".join(logs.values())
 
 
 def test_ctrl_c_during_start_up_ends_it(domain, tmp_path):
     process = start_script("start_stack.py", "--domain", domain, "--log-dir", str(tmp_path))
     try:
-        while not children(process):
+        while not (started := children(process)):
             assert process.poll() is None
-        started = children(process)
         process.send_signal(signal.SIGINT)
         out, error = process.communicate(timeout=PATIENCE)
     finally:
