@@ -1,5 +1,6 @@
 """Requests of a node to another one's service, which it may not have discovered yet."""
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from perch_core.ros.wiring import Wiring  # noqa: E402
 from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
+PATIENCE = 120.0  # only ever waited for in full when a test fails [s]
 REQUEST = PerchPlanRequest(start=0, p=np.zeros(3), p_WS=np.array([1.7, 0.0, 0.0]), q_WS=np.array([1.0, 0.0, 0.0, 0.0]))
 NONE = PerchPlan(success=False, error_code=2, message="there is no plan")
 
@@ -63,13 +65,20 @@ def node(executor, kind):
     return one
 
 
+def until(executor, done):
+    """Run callbacks until `done`."""
+    end = time.monotonic() + PATIENCE
+    while not done():
+        assert time.monotonic() < end, "it does not come"
+        executor.spin_once(0.1)
+
+
 def test_a_request_waits_for_the_discovery_of_its_service(executor):
     asking = node(executor, Asking).component
     asking.plan_perch(REQUEST, 0)
     executor.spin_once(0.1)
     node(executor, Serving)
-    while not getattr(asking, "answers", []):
-        executor.spin_once(0.1)
+    until(executor, lambda: getattr(asking, "answers", []))
     assert [answer.message for answer in asking.answers] == [NONE.message]
 
 
@@ -77,8 +86,7 @@ def test_a_service_that_nobody_offers_is_named(executor, monkeypatch):
     monkeypatch.setattr("perch_core.ros.asking.DISCOVERY", 0.1)
     asking = node(executor, Asking).component
     asking.plan_perch(REQUEST, 0)
-    while not getattr(asking, "answers", []):
-        executor.spin_once(0.1)
+    until(executor, lambda: getattr(asking, "answers", []))
     assert asking.answers == [Unavailable("service plan_perch is not there")]
 
 
@@ -87,16 +95,13 @@ def test_a_server_that_is_started_anew_while_nobody_asks_is_told(executor, monke
     asking, told = node(executor, Asking), []
     asking.component.log.receivers.append(lambda line: told.append(line.text))
     first = node(executor, Serving)
-    while not asking.get_publishers_info_by_topic("rr/plan_perchReply", no_mangle=True):
-        executor.spin_once(0.1)
+    until(executor, lambda: asking.get_publishers_info_by_topic("rr/plan_perchReply", no_mangle=True))
     for _ in range(20):
         executor.spin_once(0.02)
     assert not told
     executor.remove_node(first), close_nodes([first])
     node(executor, Serving)
-    for _ in range(300):
-        if not told:
-            executor.spin_once(0.1)
+    until(executor, lambda: told)
     assert told == ["plan_perch: another node answers from now on: it was started anew, or is a second one"]
 
 
@@ -111,12 +116,10 @@ class Silent(Serving):
 def test_a_request_whose_server_ended_is_answered_by_the_one_that_was_started_anew_and_once(executor):
     asking, silent = node(executor, Asking).component, node(executor, Silent)
     asking.plan_perch(REQUEST, 0)
-    while not hasattr(silent.component, "asked"):
-        executor.spin_once(0.1)
+    until(executor, lambda: hasattr(silent.component, "asked"))
     for _ in range(2):
         node(executor, Serving)
-    while not getattr(asking, "answers", []):
-        executor.spin_once(0.1)
+    until(executor, lambda: getattr(asking, "answers", []))
     for _ in range(20):
         executor.spin_once(0.05)
     assert [answer.message for answer in asking.answers] == [NONE.message]
