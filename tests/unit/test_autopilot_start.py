@@ -176,6 +176,13 @@ def test_a_fault_after_the_start_does_not_end_the_node(armed, peer, tmp_path):
     assert peer.switches == set()
 
 
+def catches(pid: int, number: int) -> bool:
+    """Whether a process has a handler for a signal."""
+    with open(f"/proc/{pid}/status") as lines:
+        caught = next(line for line in lines if line.startswith("SigCgt:"))
+    return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
+
+
 def until(what, process: subprocess.Popen) -> None:
     last = time.monotonic() + PATIENCE
     while not what():
@@ -223,6 +230,7 @@ class Bench:
     Attributes:
         radio: the pilot's channels [us].
         most: largest motor value.
+        steps: how many it has lived.
     """
 
     def __init__(self, *more: str) -> None:
@@ -236,6 +244,7 @@ class Bench:
         except NamespaceError as error:
             pytest.skip(str(error))
         self.radio, self.most, self._on = [1500, 1500, 1000, 1500, OFF, OFF, ON], 0.0, True
+        self.steps = 0
         self.number = os.dup(self.sitl.file)
         for _ in range(500):
             self._step()
@@ -244,6 +253,7 @@ class Bench:
 
     def _step(self) -> None:
         self.most = max(self.most, *self.sitl.step((0.0, 0.0, 0.0), GRAVITY, LEVEL, self.radio))
+        self.steps += 1
 
     def _live(self) -> None:
         while self._on:
@@ -252,6 +262,13 @@ class Bench:
 
     def started(self, **parameters: str) -> subprocess.Popen:
         return started("betaflight", (self.number,), link=f"fd:{self.number}", one_g="256.0", **parameters)
+
+    def live(self, steps: int) -> None:
+        """Wait while it lives for so many steps."""
+        end, last = self.steps + steps, time.monotonic() + PATIENCE
+        while self.steps < end:
+            assert time.monotonic() < last, "it does not live"
+            time.sleep(0.01)
 
     def close(self) -> None:
         self._on = False
@@ -264,7 +281,7 @@ def test_a_firmware_that_will_not_arm_is_refused():
     bench = Bench("aux 3 45 3 1700 2100 0 0")  # box 45 is PARALYZE, which stays on until the next start, here by AUX4
     try:
         bench.radio.append(ON)
-        time.sleep(0.5)
+        bench.live(250)
         bench.radio.pop()
         refused(bench.started(), "the autopilot refuses to arm: paralyzed: restart the autopilot")
         assert bench.most == 0.0
@@ -288,6 +305,7 @@ def test_a_firmware_that_will_arm_when_the_pilot_has_moved_his_stick_is_waited_f
     bench.radio[2], bench.radio[6] = 1500, OFF
     try:
         process = bench.started()
+        until(lambda: catches(process.pid, signal.SIGTERM), process)
         time.sleep(5.0)
         goes_on(process)
         assert bench.most == 0.0

@@ -374,13 +374,15 @@ def test_an_estimators_status_counts_where_it_is_of_now(health, state):
     assert flight.state is state
 
 
-def test_a_map_with_lines_that_are_none_is_ignored():
+@pytest.mark.parametrize("end, what_becomes", [((NAN, 0.0, 0.0), "refused"), ((0.0, 0.0, 0.0), "ignored")])
+def test_a_map_with_lines_that_are_none_is_ignored(end, what_becomes):
     params = parameters()
     params = replace(params, nmpc=replace(params.nmpc, lines=replace(params.nmpc.lines, collision=1.0)))
     flight = Flight(params=params).take_off()
-    for end in ((NAN, 0.0, 0.0), (0.0, 0.0, 0.0)):
-        flight.component.on_powerlines(PowerlineMap(flight.stamp, (MappedPowerline(1, (0.0, 0.0, 0.0), end, 0.01, np.eye(3), 0.1, 3),), False, ""))
-    assert "powerlines" in flight.said
+    flight.component.on_powerlines(PowerlineMap(flight.stamp, (MappedPowerline(1, (0.0, 0.0, 0.0), end, 0.01, np.eye(3), 0.1, 3),), False, ""))
+    assert "powerlines: " in flight.said and flight.said.endswith(f": {what_becomes}")
+    flight.step(0.1)
+    assert flight.state is State.HOVERING
 
 
 @pytest.mark.parametrize("ahead, said", [(2 * 10**9, True), (-(10**9) * 3600, False)])
