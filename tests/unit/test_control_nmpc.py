@@ -223,7 +223,7 @@ def test_rotor_thrusts_and_body_rates_keep_their_limits():
         return False
 
     loop.run(0.6, until=watch)
-    assert max(w) < 3.4, "soft limit of 3 rad/s"
+    assert max(w) < 3.4, "soft limit of 2.5 rad/s"
     assert np.min(f) >= SNAPDRAGON.thrust_min - 1e-9 and np.max(f) <= SNAPDRAGON.thrust_max + 1e-9
     assert law.failures == 0
 

@@ -42,6 +42,7 @@ class World:
         return g_B
 
     def tick(self, cancel=False):
+        assert self.time < 1000.0, f"what is waited for does not come: {self.machine.phase}, {self.machine.message}"
         if self.reference is not None and self.time >= self.reference.start_time:
             self.p = self.reference.sample(self.time - self.reference.start_time).p
         if self.perch_end is not None and self.time >= self.perch_end:

@@ -311,7 +311,9 @@ def warm_up(tmp_path, monkeypatch):
 
 
 def _wait_for(path):
+    end = time.monotonic() + 120.0
     while not path.exists():
+        assert time.monotonic() < end
         time.sleep(0.01)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 import pytest
@@ -19,6 +20,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 
+PATIENCE = 120.0  # only ever waited for in full when a test fails [s]
 DOUBLE, INTEGER, STRING, DOUBLES = (Parameter.Type[name].value for name in ("DOUBLE", "INTEGER", "STRING", "DOUBLE_ARRAY"))
 
 
@@ -53,11 +55,14 @@ class Graph:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.tuned), self.executor.add_node(self.asker)
         self.client = AsyncParameterClient(self.asker, "tuned")
+        end = time.monotonic() + PATIENCE
         while not self.client.services_are_ready():
+            assert time.monotonic() < end
             self.executor.spin_once(timeout_sec=0.05)
 
     def answer(self, future):
-        self.executor.spin_until_future_complete(future)
+        self.executor.spin_until_future_complete(future, PATIENCE)
+        assert future.done()
         return future.result()
 
     def describe(self, name):
