@@ -65,6 +65,8 @@ def test_an_imu_that_is_mounted_turned(tmp_path):
     for sample in taken:
         np.testing.assert_allclose(sample.f_B, R_BI.apply([1.0, 2.0, 9.0]), atol=1e-6)
         np.testing.assert_allclose(sample.w_B, R_BI.apply([0.1, 0.2, 0.3]), atol=1e-6)
+    file.write_text(to_yaml(plain))  # its axes are those of B, whatever the driver calls its frame
+    assert ImuIntake(print, str(file)).take(ImuSample(1, (0.1, 0.2, 0.3), (1.0, 2.0, 9.0), "fcu")).w_B == pytest.approx((0.1, 0.2, 0.3))
     assert ImuIntake(print).take(ImuSample(1, (0.1, 0.2, 0.3), (1.0, 2.0, 9.0))).w_B == (0.1, 0.2, 0.3)
 
 

@@ -269,6 +269,16 @@ def test_a_perch_holds_only_with_a_controller_that_is_attached():
     assert world.outcome.result is Result.TRACKING_LOST and "not attached" in world.outcome.message
 
 
+def test_a_landing_out_of_a_recovery_ends_the_goal_with_what_the_controller_says():
+    world = World(sticks=False, recovers=False)
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    while world.machine.phase is not Phase.RECOVERING:
+        world.tick()
+    world.controller = ControllerState.LANDING
+    world.tick()
+    assert world.outcome.result is Result.TRACKING_LOST and world.outcome.message.endswith("; says so")
+
+
 def test_recovery_without_end_is_bounded():
     world = World(sticks=False, recovers=False)
     world.run()

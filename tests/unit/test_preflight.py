@@ -63,7 +63,8 @@ def test_rates_and_stamps(stamps, rate, even):
 
 def test_silence_fails():
     assert [check.verdict for check in checks.stream("odometry", [])] == [FAILED]
-    assert [check.verdict for check in checks.frames(None, still()[0])] == [FAILED, PASSED]
+    assert [check.verdict for check in checks.frames(None, still()[0], True)] == [FAILED, PASSED]
+    assert checks.frames(None, still()[0]._replace(frame="fcu"), False)[1].verdict is FAILED
 
 
 @pytest.mark.parametrize("shift, verdict", [(0.03, PASSED), (0.6, FAILED), (-0.4, FAILED), (1.7e9, FAILED)])

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from perch_core.urdf import fixed_frames, optical_frame
-from perch_core.values import CameraModel
+from perch_core.values import CameraModel, Transform
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.preflight import checks, command
 from perch_eval.camera_turns import CameraTurns
@@ -74,12 +74,14 @@ def seen() -> Seen:
     return Seen(rest, shaken, turns.spans)
 
 
-def refused(seen: Seen, monkeypatch, capsys, axes: np.ndarray = np.eye(3), file: Vehicle = VEHICLE) -> tuple[int, list[str]]:
+def refused(seen: Seen, monkeypatch, capsys, axes: np.ndarray = np.eye(3), file: Vehicle = VEHICLE,
+            more: tuple[str, ...] = ()) -> tuple[int, list[str]]:
     """Exit code of preflight, and the names of what has failed.
 
     Args:
         axes: of the IMU, its readings are `axes` of the true ones.
         file: what the vehicle file says.
+        more: arguments.
     """
     def read(samples: list) -> list:
         return [one._replace(f_B=tuple(axes @ one.f_B), w_B=tuple(axes @ one.w_B)) for one in samples]
@@ -108,7 +110,7 @@ def refused(seen: Seen, monkeypatch, capsys, axes: np.ndarray = np.eye(3), file:
 
     monkeypatch.setattr(listener, "GraphListener", Bench)
     monkeypatch.setattr(command, "load_vehicle", lambda name: file)
-    monkeypatch.setattr("sys.argv", ["preflight.py", "--vehicle", "rpg", "--shake", "front"])
+    monkeypatch.setattr("sys.argv", ["preflight.py", "--vehicle", "rpg", "--shake", "front", *more])
     code, lines = command.main(), capsys.readouterr().out.splitlines()
     failed = [number for number, line in enumerate(lines) if line.startswith("FAILED")]
     assert all(lines[number + 1].lstrip().startswith("-> ") for number in failed), "each says what to do"
@@ -157,6 +159,27 @@ def test_a_wrong_sign_is_seen_about_the_axis_that_is_turned_about_least(axis):
     assert check.verdict is checks.Verdict.FAILED and "left-handed" in check.seen
     rates[:, axis] *= 0.4
     assert checks.shaken("front", rates * sign, rates @ MOUNT.R_BC, VEHICLE).verdict is checks.Verdict.OPEN, "not turned about enough"
+
+
+@pytest.mark.parametrize("by", ["frame", "file"])
+def test_an_imu_in_other_axes_passes_where_the_nodes_turn_it(seen, monkeypatch, capsys, tmp_path, by):
+    """Forward, right, down, placed by `/tf_static` or by the sensor file."""
+    def turned(samples, frame):
+        return [s._replace(w_B=tuple(UPSIDE_DOWN @ s.w_B), f_B=tuple(UPSIDE_DOWN @ s.f_B), frame=frame) for s in samples]
+
+    frame = "fcu" if by == "frame" else "imu_link"
+    rest = {**seen.rest, "imu/data_raw": turned(seen.rest["imu/data_raw"], frame)}
+    more: tuple[str, ...] = ()
+    if by == "frame":
+        rest["/tf_static"] = [*rest["/tf_static"], Transform("base_link", "fcu", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))]
+    else:
+        file = tmp_path / "mine.yaml"
+        file.write_text("name: mine\nimu: {rate: 500, accel_noise_density: 0.01, gyro_noise_density: 0.001, accel_bias_walk: 0.001,\n"
+                        "  gyro_bias_walk: 0.0001, orientation: [1.0, 0.0, 0.0, 0.0]}\n")
+        more = ("--sensors", str(file))
+    flipped = seen._replace(rest=rest, shaken=turned(seen.shaken, frame))
+    assert refused(flipped, monkeypatch, capsys, more=more) == (0, [])
+    assert refused(seen._replace(rest={**rest, "/tf_static": seen.rest["/tf_static"]}), monkeypatch, capsys)[0] == 1
 
 
 @pytest.mark.parametrize("turn", [(0, 0, 180), (0, 0, 10), (90, 0, 0), (0, 6, 0)])

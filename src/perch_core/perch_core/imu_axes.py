@@ -16,7 +16,7 @@ AXES_OF_B = frozenset(("imu_link", BASE, ""))
 
 
 class ImuAxes:
-    """Turns samples into the axes of B: by the sensor file where it mounts the IMU turned, otherwise by the sample's frame and `/tf_static`."""
+    """Turns samples into the axes of B: by the sensor file where it has an IMU, otherwise by the sample's frame and `/tf_static`."""
 
     def __init__(self, warn: Callable[[str, float], None], sensors: str = "") -> None:
         """
@@ -28,7 +28,7 @@ class ImuAxes:
             ConfigError: no such file, or a value that is refused.
         """
         imu = load_sensors(sensors).imu if sensors else None
-        self._R_BI = None if imu is None or np.array_equal(imu.R_BI, np.eye(3)) else imu.R_BI
+        self._R_BI = None if imu is None else imu.R_BI
         self._warn = warn
         self._transforms = StaticTransforms()
         self._turns: dict[str, np.ndarray] = {}  # frame -> R_BI

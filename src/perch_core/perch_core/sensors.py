@@ -1,7 +1,7 @@
 """What a vehicle sees and feels with: cameras and IMU as their data sheets and calibration reports have them.
 
-One YAML file in `config/sensors/` each. Perception reads it (parameter `sensors` of its nodes), `scripts/perceive.py` does for recordings,
-and `scripts/sensors.py import` makes one of a Kalibr or EuRoC calibration. The simulator does not: what it draws is another matter.
+One YAML file in `config/sensors/` each. Nodes read it (parameter `sensors`), `scripts/perceive.py` does for recordings, and
+`scripts/sensors.py import` makes one of a Kalibr or EuRoC calibration. The simulator does not: what it draws is another matter.
 """
 
 from __future__ import annotations

@@ -107,8 +107,7 @@ def geometric_step(state, reference, extra, gains, limits, J):
         J: principal moments of inertia [kg m^2], 3 floats.
 
     Returns:
-        Specific thrust along b3 [m/s^2], moment (3) [N m], q_C (4), w_C and dw_C turned into B (3, 3), attitude error
-        angle of b3 is left to the caller.
+        Specific thrust along b3 [m/s^2], moment (3) [N m], q_C (4), w_C and dw_C turned into B (3, 3).
     """
     p, v = (state[0], state[1], state[2]), (state[3], state[4], state[5])
     q, w = (state[6], state[7], state[8], state[9]), (state[10], state[11], state[12])

@@ -73,7 +73,7 @@ def rotors_for(wrench, speed, vehicle, lead):
     Args:
         wrench: thrust [N] and moments [N m], 4 floats.
         speed: present rotor speeds [rad/s], 4 floats.
-        vehicle: constants as `VehicleConstants.packed` gives them.
+        vehicle: constants as `packed_vehicle` gives them.
         lead: [s].
 
     Returns:

@@ -198,7 +198,9 @@ class MissionMachine(ABC):
             self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
             return
         if inputs.controller in (ControllerState.DISARMED, ControllerState.LANDING):
-            self._end(outputs, Result.CANCELLED if self._cancelled else Result.CRASHED, f"{self._failure}; on the ground or descending")
+            landing = inputs.controller is ControllerState.LANDING
+            result = Result.CANCELLED if self._cancelled else Result.TRACKING_LOST if landing else Result.CRASHED
+            self._end(outputs, result, f"{self._failure}; {inputs.controller_message if landing else 'on the ground'}")
         elif self._elapsed(inputs) > self.settings.phase_timeout:
             outputs.commands.append((Command.LAND, "recovery took too long"))
             self._end(outputs, Result.TRACKING_LOST, f"{self._failure}; no hover within {self.settings.phase_timeout:g} s, landing")

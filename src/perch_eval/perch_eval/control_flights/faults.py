@@ -35,7 +35,7 @@ Strike = Callable[[ScriptedFlight, np.random.Generator], str]
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of the issue's point 6.
+    """A fault in flight.
 
     Attributes:
         name: for people and files.

@@ -154,11 +154,12 @@ def extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]
     return found
 
 
-def frames(odometry: OdometryState | None, imu: ImuSample | None) -> list[Check]:
-    """Names of frames."""
-    return [judged(f"frame {name}", value is not None and value.frame in good, "nothing" if value is None else repr(value.frame),
-                   f"must be {good[0]!r}")
-            for name, value, good in (("odometry", odometry, ("map",)), ("imu/data_raw", imu, ("imu_link", "base_link", "")))]
+def frames(odometry: OdometryState | None, imu: ImuSample | None, placed: bool) -> list[Check]:
+    """Names of frames; `placed`: the nodes know the axes of the IMU."""
+    return [judged(f"frame {name}", value is not None and good, "nothing" if value is None else repr(value.frame), advice)
+            for name, value, good, advice in (
+                ("odometry", odometry, odometry is not None and odometry.frame == "map", "must be 'map'"),
+                ("imu/data_raw", imu, placed, "must be 'imu_link', or placed in base_link by /tf_static or --sensors"))]
 
 
 def camera_rotation(turned_B: np.ndarray, turned_C: np.ndarray) -> tuple[np.ndarray, float]:

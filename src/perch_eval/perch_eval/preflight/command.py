@@ -10,6 +10,8 @@ import numpy as np
 
 from perch_control.modes import Command, State
 from perch_core.errors import PerchError
+from perch_core.imu_axes import ImuAxes
+from perch_core.values import ImuSample
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.arguments import command, command_parser
 from perch_eval.preflight import checks
@@ -30,6 +32,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line."""
     out = command_parser("preflight.py", "Check a running vehicle before it flies.", EXAMPLES)
     out.add_argument("--vehicle", required=True, help="vehicle file, or its name in config/vehicles")
+    out.add_argument("--sensors", default="", help="sensor file that its nodes are given: axes of the IMU")
     out.add_argument("--namespace", default="", help="namespace of its nodes")
     out.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
     out.add_argument("--shake", choices=("down", "front"),
@@ -40,26 +43,35 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def listened(listener: Any, vehicle: Vehicle) -> list[Check]:
+def in_body(listener: Any, sensors: str) -> list[ImuSample]:
+    """The IMU samples that were heard, in the axes of B, as the nodes turn them; none where their axes are not known."""
+    axes = ImuAxes(lambda *_: None, sensors)
+    for _, transform in listener.values["/tf_static"]:
+        axes.add_transform(transform)
+    return [taken for _, sample in listener.values["imu/data_raw"] if (taken := axes.in_body(sample)) is not None]
+
+
+def listened(listener: Any, vehicle: Vehicle, sensors: str = "") -> list[Check]:
     """What is judged of a vehicle at rest."""
     values = {channel: [value for _, value in entries] for channel, entries in listener.values.items()}
     channels = [c for c in checks.RATES if not c.startswith("camera_") or c.split("/")[0].removeprefix("camera_") in vehicle.mounts]
     found = [check for channel in channels for check in checks.stream(channel, [value.stamp for value in values[channel]])]
     seen = {name: listener.stamped(f"camera_{name}/camera_info") for name in vehicle.mounts}
     found += checks.clocks(listener.stamped("imu/data_raw"), seen)
-    found += checks.frames(listener.newest("odometry"), listener.newest("imu/data_raw"))
-    found += checks.rest(values["imu/data_raw"])
+    imu = in_body(listener, sensors)
+    found += checks.frames(listener.newest("odometry"), listener.newest("imu/data_raw"), bool(imu))
+    found += checks.rest(imu)
     found += [checks.camera_model(name, listener.newest(f"camera_{name}/camera_info"), vehicle) for name in vehicle.mounts]
     return found + checks.extrinsics(values["/tf_static"], vehicle)
 
 
-def shaken(listener: Any, vehicle: Vehicle, camera: str) -> Check:
+def shaken(listener: Any, vehicle: Vehicle, camera: str, sensors: str = "") -> Check:
     """The rotation between camera and IMU, told while the vehicle is shaken."""
     if camera:
         listener.watch(camera, vehicle.mounts[camera].camera)
         print("shake the vehicle about all axes for 10 s ...", flush=True)
         listener.listen(10.0)
-        imu = [value for _, value in listener.values["imu/data_raw"]]
+        imu = in_body(listener, sensors)
         turned_B, turned_C = listener.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3),
                                      vehicle.mounts[camera].stamp_offset)
     else:
@@ -104,7 +116,7 @@ def _check(arguments: argparse.Namespace) -> int:
         print(f"listening for {arguments.listen:g} s: the vehicle must stand still on its feet ...", flush=True)
         listener.await_first("imu/data_raw", arguments.listen)
         listener.listen(arguments.listen)
-        found = [*listened(listener, vehicle), shaken(listener, vehicle, arguments.shake or ""),
+        found = [*listened(listener, vehicle, arguments.sensors), shaken(listener, vehicle, arguments.shake or "", arguments.sensors),
                  *exercised(listener, arguments, checks.STOPPED if vehicle.actuation.type == "rotor_speeds" else checks.DESCENDED)]
     print("\n".join(map(str, found)))
     counts = {verdict: sum(check.verdict is verdict for check in found) for verdict in Verdict}
