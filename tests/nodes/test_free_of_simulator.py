@@ -6,8 +6,9 @@ import re
 
 import numpy as np
 import pytest
-from nodes.node_process import PLAIN, plain, set_parameter
+from nodes.node_process import PLAIN, nodes, plain, set_parameter
 from perch_core.vehicle import load_vehicle
+from perch_eval.domain import reserved_domain
 
 
 def test_the_plain_scripts_import_nothing_of_perch_but_messages():
@@ -45,10 +46,26 @@ def test_time_may_be_that_of_a_clock_topic(graph):
         set_parameter(chosen, "use_sim_time", False)
 
 
-@pytest.mark.parametrize("kind", ["raw", "compressed"])
-def test_cameras_of_anybody_are_used(kind, graph):
-    """Images lead to odometry by the nodes `vio` and `estimator`, and with it to the pose of the board."""
+@pytest.fixture(scope="module")
+def unpacking(tmp_path_factory):
+    """The nodes that see, for compressed images."""
+    packed = {"images": "image_raw/compressed"}
+    with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(domain))
+        with nodes(("estimator", "vio", "target_localizer"), tmp_path_factory.mktemp("unpacking"),
+                   parameters={"vio": packed, "target_localizer": packed}) as running:
+            yield running
+
+
+@pytest.mark.parametrize("kind, chain", [("raw", "graph"), ("both", "graph"), ("compressed", "unpacking")])
+def test_cameras_of_anybody_are_used(kind, chain, request, monkeypatch):
+    """Images lead to odometry by the nodes `vio` and `estimator`, and with it to the pose of the board. `both`, as drivers with
+    `image_transport` publish them: each image is used once."""
+    running = request.getfixturevalue(chain)
+    monkeypatch.setenv("ROS_DOMAIN_ID", running["vio"].domain)
+    refused = running["vio"].log.count("not newer")
     seen = plain("cameras.py", kind)
+    assert running["vio"].log.count("not newer") == refused
     poses, targets = np.array(seen["poses"]), np.array(seen["targets"])
     assert len(poses) >= 20 and len(targets) >= 5
     assert np.ptp(poses, axis=0).max() < 0.02, "a vehicle at rest moves"

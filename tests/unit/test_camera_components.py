@@ -13,6 +13,7 @@ from perch_core.vehicle import load_vehicle
 from perch_perception.camera_component import MOST_WAITING
 from perch_perception.powerline_mapper import PowerlineMapper, PowerlineMapperConfig
 from perch_perception.tags import Localization
+from perch_perception.tags.pose import BoardPose
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
 
 from unit.component_outputs import Outputs
@@ -102,6 +103,22 @@ def test_repeated_images_and_those_of_another_time_are_told_and_do_not_spoil_the
     assert bench.exposures == [100 + EXPOSED // MS, 150 + EXPOSED // MS]
     messages = [s.message for s in bench.out["sighting"]]
     assert "not newer" in messages[1] and "not newer" in messages[2] and "ahead of the odometry" in messages[3]
+
+
+def test_the_average_of_an_image_is_taken_once_it_is_good():
+    """A poor one, from far away, is waited over."""
+    bench = Bench(mode="average")
+    seen = iter((0.3, 0.3, 0.01, 0.01))
+
+    def process(image, exposed, body):
+        pose = BoardPose(np.array([0.0, 0.0, 2.0]), np.eye(3), next(seen) ** 2 * np.eye(6), (0, 1, 2, 3), 0.1, np.zeros((6, 4)))
+        return Localization(pose, pose, complete=True)
+
+    bench.eye.process = process
+    bench.odometry(0, 400)
+    for ms in (50, 100, 150, 200):
+        bench.image(ms)
+    assert [one.found for one in bench.out["sighting"]] == [True] * 4 and len(bench.out["pose"]) == 1
 
 
 def test_the_queue_is_bounded():

@@ -195,6 +195,7 @@ def test_axes_of_another_frame_are_turned_or_refused():
             hover.tell(state(hover.now))
         hover.estimator.on_imu(hover.sample(w_B=(0.1, 0.0, 0.0), f_B=(1.0, 0.0, 9.81)))
     np.testing.assert_allclose(hover.last.w_B, (0.0, 0.1, 0.0), atol=1e-12)
+    assert any("0.100 m from base_link" in text for text in hover.out.warnings())
 
 
 @pytest.mark.parametrize("transform", [

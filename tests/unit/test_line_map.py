@@ -215,6 +215,21 @@ def test_a_wire_out_of_view_stays_beside_its_neighbour_that_is_seen():
         assert k < 35 or len(lines) == 2, (k, lines)
 
 
+def test_two_that_turn_out_to_be_one_were_last_seen_when_either_was():
+    maps, wire = [], WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0]))
+    for begin in (0.0, 10.0):
+        rng, mapper = np.random.default_rng(16), LineMapper(MapperConfig())
+        for k in range(30):
+            time, true = begin + 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
+            body = BodyState(time, true, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+            mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time)])
+        maps.append(mapper)
+    older, newer = maps
+    older._tracks += newer._tracks
+    older._merge()
+    assert [track.last.time for track in older._tracks] == [newer._tracks[0].last.time]
+
+
 def test_pieces_of_a_wire_keep_numbers_of_their_own_after_many_wires():
     rng, mapper = np.random.default_rng(15), LineMapper(MapperConfig())
     sagging, straight = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0]), 0.05), WireCurve(np.array([3.0, 0.0, 4.5]), np.array([0.0, 1.0, 0.0]))

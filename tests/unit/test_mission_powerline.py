@@ -5,6 +5,7 @@ import pytest
 
 from perch_core import so3
 from perch_core.values import MappedPowerline, PowerlineMap
+from perch_core.values.limits import PLAN_LINES_MAX
 from perch_control.mission.line_target import mapped_target
 from perch_control.mission.values import Goal
 
@@ -50,6 +51,13 @@ def test_points_beyond_the_ends_are_brought_to_the_line():
 def test_no_line_near_the_point_is_no_target():
     assert target_of(LINES, (0.0, 0.0, 0.0), 1.0) is None
     assert target_of([], (4.0, 0.0, 4.25), 1.0) is None
+
+
+def test_of_a_long_flights_map_the_nearest_lines_are_planned_among():
+    far = [mapped(100 + k, (4.0 + 5.0 * k, -2.0, 4.25), (4.0 + 5.0 * k, 2.0, 4.25)) for k in range(1, 150)]
+    target = target_of([*reversed(far), *LINES], (4.0, 0.0, 4.25), 1.0)
+    assert target.line == 3 and {3, 7} <= {line.id for line in target.lines} and len(target.lines) == PLAN_LINES_MAX
+    assert max(line.segment.centre[0] for line in target.lines) < 4.0 + 5.0 * PLAN_LINES_MAX
 
 
 def test_a_vertical_line_is_no_target():

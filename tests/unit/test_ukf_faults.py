@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from perch_perception.ukf import Estimator, Health, ImuOutcome, ImuSample, VioOutcome
+from perch_perception.ukf.config import ImuNoise
+from perch_perception.ukf.imu_buffer import ImuBuffer
 from unit.estimator_flight import MS, Flight
 
 
@@ -67,6 +69,19 @@ def test_a_waiting_pose_is_applied_when_the_imu_gets_there():
     np.testing.assert_allclose(ahead.estimator.estimate.p_WB, prompt.estimator.estimate.p_WB, atol=2e-3)
 
 
+def test_poses_that_come_faster_than_the_imu_and_before_it_are_all_used():
+    """Motion capture at 240 Hz beside an IMU at 100 Hz."""
+    estimator, pose = Estimator(), next(iter(Flight(10).poses.values()))
+    told = 0
+    for k in range(1, 300):
+        now = k * 10 * MS
+        while told * 4_166_667 < now + 3 * MS:
+            estimator.add_vio(replace(pose, stamp=told * 4_166_667, p_WB=np.zeros(3), q_WB=np.array([0.0, 0.0, 0.0, 1.0]), inertial=None))
+            told += 1
+        estimator.add_imu(ImuSample(now, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)))
+    assert estimator.status.health is Health.RUNNING and estimator.status.vio_age < 0.02
+
+
 def test_a_jump_of_vios_map_is_gated_first_and_accepted_when_it_lasts():
     flight = Flight(11).fly(end=1500)
     flight.poses = {k: replace(p, p_WB=p.p_WB + [0.5, 0, 0]) if k >= 1480 else p for k, p in flight.poses.items()}
@@ -96,6 +111,15 @@ def test_saturated_imu_samples_count_with_a_larger_covariance(make, outcome):
     bad.fly(1505, 2000)
     assert np.linalg.norm(bad.error()[:3]) < 0.15
     bad.assert_sane()
+
+
+@pytest.mark.parametrize(("integration", "noisy"), [("mean", 1), ("instant", 2)])
+def test_each_step_that_a_saturated_sample_is_part_of_is_noisy(integration, noisy):
+    buffer = ImuBuffer(ImuNoise(integration=integration), 1.0)
+    for k in range(20):
+        buffer.add(ImuSample(k * 2 * MS, (0.0,) * 3, (0.0, 0.0, 156.0 if k == 10 else 9.81)))
+    variance = buffer.run(0, 38 * MS)[:, 8]
+    assert (variance > 1e4).sum() == noisy
 
 
 def test_an_imu_gap_grows_the_covariance_and_heals():

@@ -44,6 +44,30 @@ def test_a_steady_climb_is_not_rest():
     assert late[-1][1] == pytest.approx(0.015 + 0.3 * (seen[-1][0] - 1.1), abs=0.05)
 
 
+@pytest.mark.parametrize("leaves", [False, True])
+def test_a_camera_that_was_silent_for_longer_than_the_imu_is_kept_is_used_again(leaves):
+    """At rest it rests where it did. Where it moved when the images stopped, position and heading are as uncertain as they then are."""
+    rng, mount, frame = np.random.default_rng(1), load_vehicle("snapdragon").mounts["down"], 0.1
+    vio, seen = VisualInertialOdometry(VioConfig(), mount, np.array([0.5, 0.2, 1.0])), []
+    for k in range(5500):
+        t = 0.002 * k
+        up = 9.81 + (3.0 if leaves and 1.0 <= t < 1.4 else -3.0 if leaves and 1.4 <= t < 1.8 else 0.0)
+        vio.add_imu(ImuSample(k * 2 * MS, tuple(rng.normal(0, 0.002, 3)), tuple(rng.normal(0, 0.05, 3) + [0, 0, up])))
+        if t > frame + 0.02:
+            if not 1.3 < frame < 9.0:
+                image = np.clip(rng.normal(110, 4, (480, 640)), 0, 255).astype(np.uint8)
+                seen.append((frame, vio.add_image(round(frame * 1e9), image)))
+            frame += 1 / 30
+    before, after = (next(r for t, r in reversed(seen) if t < 1.0), seen[-1][1])
+    assert before.outcome is FrameOutcome.RESTING is after.outcome, after.message
+    sigma = np.sqrt(np.diag(after.estimate.pose_covariance))
+    if leaves:
+        assert sigma[:3].max() > 1.0 and sigma[5] > 1.0
+    else:
+        np.testing.assert_allclose(after.estimate.p_WB, before.estimate.p_WB, atol=0.01)
+        assert sigma[:3].max() < 0.05 and sigma[5] < 0.1
+
+
 ATTITUDES = {"ground": np.zeros(3), "wall": np.array([0.1, -1.5, 0.2]), "upside down": np.array([3.0, 0.2, 0.0])}
 
 

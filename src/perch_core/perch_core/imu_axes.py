@@ -12,6 +12,7 @@ from perch_core.values import ImuSample, Transform
 
 IMU_AXES = "sensor file, config/sensors/<name>.yaml or a path: axes of the IMU; empty: those of its frame by /tf_static"
 """The parameter `sensors` of a node that needs no more of the file."""
+_ORIGIN = 0.01  # an IMU further from the origin of B is told of [m]
 AXES_OF_B = frozenset(("imu_link", BASE, ""))
 
 
@@ -56,6 +57,8 @@ class ImuAxes:
                 self._warn(f"imu/data_raw: frame {frame!r} is not imu_link: samples are not used until /tf_static says "
                            f"where it is in {BASE}", 1.0)
                 return None
+            if (away := float(np.linalg.norm(place[0]))) > _ORIGIN:
+                self._warn(f"imu/data_raw: {frame!r} is {away:.3f} m from {BASE}, whose origin has to be in the IMU: the distance is not used", 1.0)
             self._turns[frame] = place[1]
         return self._turns[frame]
 

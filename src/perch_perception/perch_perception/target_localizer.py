@@ -153,7 +153,7 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
             if self._fused is not None:
                 target, frames = self._fused, self._fused.frames
         elif method == "average":
-            fresh = self._averaged is None and average is not None  # the first complete image, once
+            fresh = self._averaged is None and average is not None and self._good(measured.covariance)  # the first good complete image, once
             if fresh:
                 self._averaged = measured
             elif self._averaged is None:

@@ -1,5 +1,5 @@
 """A camera over a textured floor and one at a board of four AprilTags, both at rest, from plain publishers: nothing of perch is
-imported. `cameras.py raw|compressed` prints what came back as JSON. Nobody but the nodes themselves says where the vehicle is."""
+imported. `cameras.py raw|compressed|both` prints what came back as JSON. Nobody but the nodes themselves says where the vehicle is."""
 
 import array
 import json
@@ -32,15 +32,16 @@ def board(size: float) -> np.ndarray:
 
 
 class Cameras(Node):
-    def __init__(self, compressed: bool) -> None:
+    def __init__(self, kinds: str) -> None:
         super().__init__("plain_cameras")
         rng = np.random.default_rng(1)
         floor = cv2.GaussianBlur(rng.integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8), (0, 0), 2.0)
         self.images = {"down": cv2.normalize(floor, None, 0, 255, cv2.NORM_MINMAX), "front": board(0.16)}
-        self.compressed, self.ticks = compressed, 0
-        self.stamp = time.time_ns() + (20 if compressed else 10) * 10**9  # evidently another stream than that of the script before
-        kind, suffix = (CompressedImage, "/compressed") if compressed else (Image, "")
-        self.cameras = {name: (self.create_publisher(kind, f"camera_{name}/image_raw{suffix}", qos_profile_sensor_data),
+        self.ticks = 0
+        self.stamp = time.time_ns() + {"raw": 10, "both": 20, "compressed": 30}[kinds] * 10**9  # evidently another stream than that of the script before
+        topics = {Image: "image_raw", CompressedImage: "image_raw/compressed"}
+        wanted = {"raw": [Image], "both": [CompressedImage, Image], "compressed": [CompressedImage]}[kinds]
+        self.cameras = {name: ([(kind, self.create_publisher(kind, f"camera_{name}/{topics[kind]}", qos_profile_sensor_data)) for kind in wanted],
                                self.create_publisher(CameraInfo, f"camera_{name}/camera_info", qos_profile_sensor_data)) for name in self.images}
         self.imu = self.create_publisher(Imu, "imu/data_raw", qos_profile_sensor_data)
         self.poses, self.targets = [], []
@@ -65,19 +66,21 @@ class Cameras(Node):
 
     def show(self, name: str, now) -> None:
         pixels, (images, infos) = self.images[name], self.cameras[name]
-        if self.compressed:
-            image = CompressedImage(format="png", data=array.array("B", cv2.imencode(".png", pixels)[1].tobytes()))
-        else:
-            image = Image(height=HEIGHT, width=WIDTH, encoding="8UC1", step=WIDTH, data=array.array("B", pixels.tobytes()))  # of bytes, ROS would check each
         info = CameraInfo(height=HEIGHT, width=WIDTH, distortion_model="plumb_bob", d=[0.0] * 5)
         info.k = np.array([FOCAL, 0.0, WIDTH / 2 - 0.5, 0.0, FOCAL, HEIGHT / 2 - 0.5, 0.0, 0.0, 1.0])
-        image.header.stamp = info.header.stamp = now
-        image.header.frame_id = info.header.frame_id = f"camera_{name}_optical_frame"
-        infos.publish(info), images.publish(image)
+        info.header.stamp, info.header.frame_id = now, f"camera_{name}_optical_frame"
+        infos.publish(info)
+        for kind, publisher in images:
+            if kind is CompressedImage:
+                image = kind(format="png", data=array.array("B", cv2.imencode(".png", pixels)[1].tobytes()))
+            else:
+                image = kind(height=HEIGHT, width=WIDTH, encoding="8UC1", step=WIDTH, data=array.array("B", pixels.tobytes()))  # of bytes, ROS would check each
+            image.header = info.header
+            publisher.publish(image)
 
 
 rclpy.init()
-node = Cameras("compressed" in sys.argv)
+node = Cameras(sys.argv[1])
 end = time.monotonic() + 250.0
 while (len(node.poses) < 20 or len(node.targets) < 5) and time.monotonic() < end:
     rclpy.spin_once(node, timeout_sec=0.1)

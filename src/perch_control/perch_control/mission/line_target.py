@@ -9,6 +9,7 @@ from perch_core.covariance import largest_sigma
 from perch_core.errors import PerchError
 from perch_core.lines import perch_normal
 from perch_core.values import PowerlineMap, seconds
+from perch_core.values.limits import PLAN_LINES_MAX
 from perch_control.mission.values import Goal, Target
 
 _REACH = 0.4  # a line that is farther from the goal's point is another one [m]
@@ -23,7 +24,8 @@ def mapped_target(lines: PowerlineMap, goal: Goal, p_WB: np.ndarray) -> Target |
         p_WB: where the vehicle looks from [m], shape (3,).
 
     Returns:
-        The target, b2 along the line and b3 leaning towards the vehicle's side; None where no line passes near, or a vertical one.
+        The target, b2 along the line and b3 leaning towards the vehicle's side, with the nearest lines, as many as a plan takes; None where
+        no line passes near, or a vertical one.
     """
     segments = [mapped.segment for mapped in lines.lines]
     near = [(float(line.distance(goal.perch_point)), k) for k, line in enumerate(segments)]
@@ -38,4 +40,4 @@ def mapped_target(lines: PowerlineMap, goal: Goal, p_WB: np.ndarray) -> Target |
         return None
     q_WS = so3.quat_from_matrix(np.stack([np.cross(line.direction, b3), line.direction, b3], axis=1))
     return Target(seconds(lines.stamp), point, q_WS, largest_sigma(np.reshape(mapped.covariance, (3, 3))), mapped.direction_sigma,
-                  lines=lines.lines, line=mapped.id)
+                  lines=tuple(lines.lines[k] for k in sorted(k for _, k in sorted(near)[:PLAN_LINES_MAX])), line=mapped.id)

@@ -11,12 +11,11 @@ from perch_core.component import Input
 from perch_core.errors import PerchError
 from perch_core.ros import qos, topics
 from perch_core.ros.component_node import ComponentNode
-from perch_core.values import CameraImage, Serialized
+from perch_core.values import Serialized
 from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
 
 TAKE = 0.02  # lazy inputs are taken this often where nothing else asks for them [s]
-COMPRESSED = "/compressed"
 SHARED = ("/tf", "/tf_static")  # topics with many writers, inside this process and outside
 
 
@@ -59,10 +58,6 @@ class Intake:
             self._lazy.append((subscription, receive))
         else:
             node.create_subscription(row.message, channel, partial(self.enter, receive), profile, raw=True)
-        if port.value is CameraImage and channel.endswith("image_raw"):
-            packed = topics.topic(channel + COMPRESSED)
-            receive = _Reader(node, channel + COMPRESSED, packed, handler)
-            node.create_subscription(packed.message, channel + COMPRESSED, partial(self.enter, receive), packed.qos.subscribe, raw=True)
 
     def take_lazy(self) -> None:
         """Take what waits in the middleware."""

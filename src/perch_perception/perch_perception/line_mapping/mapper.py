@@ -94,7 +94,7 @@ class LineMapper:
         self._merge()
         self._supersede(time)
         self._tracks = [t for t in self._tracks
-                        if t.estimate is not None or time - t.last.time <= FORGET_AFTER]
+                        if (t.estimate is not None and t.attached < CERTAIN) or time - t.last.time <= FORGET_AFTER]
         return self.map(time)
 
     def _judge(self, seen: Sequence[LineObservation], owners: Sequence[int | None],
@@ -173,6 +173,7 @@ class LineMapper:
             while len(merged) > MOST_OBSERVATIONS:
                 merged = _thinned(merged)
             twin.observations, twin.count, twin.attached = merged, twin.count + track.count, twin.attached + track.attached
+            twin.last = max(twin.last, track.last, key=lambda one: one.time)
             self._triangulate(twin)
         self._tracks = kept
 

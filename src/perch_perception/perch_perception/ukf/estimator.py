@@ -72,7 +72,7 @@ class Estimator:
             if self._lag >= COVARIANCE_STRIDE:
                 self._refresh()
                 self._rest()
-        if self._waiting and self._waiting[0].stamp <= self._imu.newest.stamp:
+        while self._waiting and self._waiting[0].stamp <= self._imu.newest.stamp:
             self.add_vio(self._waiting.pop(0))
         return outcome
 

@@ -92,10 +92,10 @@ class ImuBuffer:
             # the error persists over the gap: its variance must not average out over the one long step
             gyro, accel = gyro + _GAP_GYRO**2, accel + _GAP_ACCEL**2
             outcome = ImuOutcome.GAP
-        s = sample
-        if max(abs(s.w_B[0]), abs(s.w_B[1]), abs(s.w_B[2])) >= 0.99 * imu.gyro_range:
+        ends = (sample, last) if self._instant else (sample,)  # what the step is made of
+        if max(abs(x) for s in ends for x in s.w_B) >= 0.99 * imu.gyro_range:
             gyro, outcome = gyro + imu.gyro_range**2, ImuOutcome.SATURATED  # it may be off by as much again
-        if max(abs(s.f_B[0]), abs(s.f_B[1]), abs(s.f_B[2])) >= 0.99 * imu.accel_range:
+        if max(abs(x) for s in ends for x in s.f_B) >= 0.99 * imu.accel_range:
             accel, outcome = accel + imu.accel_range**2, ImuOutcome.SATURATED
         self._ends.append(sample.stamp)
         self._rows.append((dt, *w, *f, gyro, accel))

@@ -139,6 +139,8 @@ class VisualInertialOdometry:
         if problem is not None:
             return VioResult(problem, restarts=self.restarts, message=f"frame {stamp} ns {problem.value}")
         self._last_image = stamp
+        if self._last_exposed is not None and self._last_exposed < self._imu.oldest:
+            self._resume()
         features = self._track(image, exposed)
         self._frame += 1
         if self.filter is None:
@@ -158,9 +160,25 @@ class VisualInertialOdometry:
             return FrameOutcome.NOT_NEWER
         if exposed > self._imu.last.stamp:
             return FrameOutcome.FUTURE
-        if exposed < self._imu.oldest or (self.filter and self.filter.state.stamp < self._imu.oldest):
-            return FrameOutcome.TOO_OLD
-        return None
+        return FrameOutcome.TOO_OLD if exposed < self._imu.oldest else None
+
+    def _resume(self) -> None:
+        """Images have stopped for longer than the IMU is remembered: start again from what was known.
+
+        What rested is taken to rest there still. What moved may have turned by any angle.
+        """
+        moved = self._lost is not None or (self.filter is not None and not self._resting)
+        if self.filter is not None:
+            self._forget_state()
+        if moved:
+            covariance = self._known.covariance.copy()
+            covariance[3, :3] = covariance[:3, 3] = 0.0
+            covariance[3, 3] = np.pi**2 / 3.0  # all headings alike
+            self._known = replace(self._known, covariance=covariance)
+        self.tracker.reset()
+        self._seen.clear()
+        self._views.clear()
+        self._last_exposed = None
 
     def _track(self, image: np.ndarray, exposed: int) -> Features:
         state = self.filter.state if self.filter else None
