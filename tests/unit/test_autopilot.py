@@ -226,20 +226,20 @@ def test_hover_and_descent_without_commands_follow_the_battery(flown_on, monkeyp
     assert (dog.channels(1.1)[2], dog.channels(1.6)[2]) == empty
 
 
-def polled(node: Betaflight, start: float, count: int, armed: bool = False) -> list[str]:
-    """What a node says in so many polls, 100 a second from a time [s]: lines of its log, each once."""
+def polled(node: Betaflight, start: float, count: int, thrust: float | None = None) -> list[str]:
+    """What a node says in so many polls, 100 a second from a time [s], with armed commands of a thrust or none: lines of its log, each once."""
     lines: list = []
     node.log.receivers.append(lines.append)
     for k in range(count):
-        if armed:
-            node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+        if thrust is not None:
+            node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), thrust))
         node.on_poll(round(start * 1e9) + k * 10_000_000)
     node.log.receivers.remove(lines.append)
     return [text for text in dict.fromkeys(line.text for line in lines) if text != "autopilot: following"]
 
 
 def test_a_pilot_who_has_not_handed_over_is_named_though_the_firmware_gives_no_reason(flown_on):
-    said, = polled(flown_on(16.0), 100.0, 200, armed=True)
+    said, = polled(flown_on(16.0), 100.0, 200, 9.81)
     assert said == "the autopilot refuses to arm: the pilot has not handed over: switch MSP OVERRIDE on"
 
 
@@ -255,18 +255,17 @@ def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):
         assert {report.level for report in reports[before:]} == {0}
 
 
-@pytest.mark.parametrize("armed", [False, True])
-def test_a_process_that_holds_the_link_and_ends_is_replaced(armed, flown_on, monkeypatch):
-    """What flies keeps its throttle, and the new process is told of a hover, so that it descends where no command follows."""
+@pytest.mark.parametrize("armed, thrust", [(False, 9.81), (True, 9.81), (True, 0.0)])
+def test_a_process_that_holds_the_link_and_ends_is_replaced(armed, thrust, flown_on, monkeypatch):
+    """What flies keeps its throttle, and the new process is told of a hover, so that it descends where no command follows; what idles, idles."""
     monkeypatch.setattr(StubAutopilot, "armed", armed)
     node = flown_on(16.0)
-    assert polled(node, 1.0, 50, armed=True) == []
+    assert polled(node, 1.0, 50, thrust) == []
     last, opened = node._link, StubAutopilot.opened
     last.ended = True
     assert polled(node, 1.5, 10) == ["the process that holds the link has ended: another one is started"]
     assert StubAutopilot.opened == opened + 1 and last.closed and not node._link.closed
-    hover = True, node._sticks.channels((0.0, 0.0, 0.0), 9.81)
-    assert node._link.told == (["turning", hover] if armed else [])
+    assert node._link.told == (["turning", (True, node._sticks.channels((0.0, 0.0, 0.0), thrust))] if armed else [])
     for k in range(100):
         node._link.ended = True
         node.on_poll(round(1.6e9) + k * 10_000_000)
@@ -386,6 +385,23 @@ def test_a_fresh_command_goes_on_and_a_stale_one_never_does():
         if 1.0 < age:
             assert channels[4] == OFF or channels[2] < 1450  # descends or is off within 1 s
     assert sent[-1][4] == OFF and sent[-1][2] == 1000
+
+
+IDLE = (1502, 1540, 1002, 1498)  # rates follow the gyroscope, also in a hand
+
+
+@pytest.mark.parametrize("sticks, lifted", [(IDLE, False), ((1500, 1500, 1300, 1500), True), ((1500, 1350, 1000, 1500), True)],
+                         ids=["idle", "thrust", "turn"])
+def test_where_no_command_since_arming_has_asked_for_lift_the_throttle_stays_down(sticks, lifted):
+    """And the motors are off after half a second."""
+    dog = Watchdog(hover=1450, descent=1420)
+    for armed, last in ((True, STICKS), (False, STICKS), (True, IDLE), (True, sticks), (True, IDLE)):
+        dog.command(0.0, armed, last)
+    for age in (0.041, 0.49):
+        assert dog.channels(age) == ((1500, 1500, 1450, 1500, ON, ON) if lifted else (1500, 1500, 1000, 1500, ON, OFF))
+    assert dog.channels(0.51)[4] == (ON if lifted else OFF) and dog.channels(4.01)[4] == OFF
+    dog.command(5.0, True, STICKS)
+    assert dog.channels(5.0)[4] == OFF  # only a command to disarm lets the next one arm
 
 
 def test_after_motors_were_taken_away_only_a_new_arming_turns_them_on():

@@ -14,7 +14,7 @@ from perch_autopilot.clock import jumped
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rates import Sticks, commanded_vehicle, rate_curves
-from perch_autopilot.watchdog import CENTRED, DESCENT, DISARM_AFTER
+from perch_autopilot.watchdog import CENTRED, DESCENT, DISARM_AFTER, lifts
 from perch_autopilot.link import REOPEN, LinkError
 
 _HANDSHAKE = 2.0                     # for the autopilot's version [s]
@@ -68,7 +68,7 @@ class Betaflight(Component[BetaflightParameters]):
         self._attitude: tuple[float, float, float] | None = None
         self._battery: msp.Battery | None = None
         self._wanted_since: int | None = None   # the host's time since which it has been told to arm without doing so [ns]
-        self._wanted = False
+        self._wanted = self._lifted = False     # it shall turn its motors; a command since arming has asked for lift
         self._now: int | None = None            # of the last poll [ns]
         self._answered = self._diagnosed = self._opened = self._torn = 0
 
@@ -113,7 +113,9 @@ class Betaflight(Component[BetaflightParameters]):
             self.warn(f"rates_thrust_command: {values} is not finite, or beyond any vehicle: ignored", every=1.0)
             return
         self._wanted = command.armed
-        self._link.command(command.armed, self._sticks.channels(command.w_B, command.thrust) if command.armed else CENTRED)
+        sticks = self._sticks.channels(command.w_B, command.thrust) if command.armed else CENTRED
+        self._lifted = command.armed and (self._lifted or lifts(sticks, self._throttles()[0]))
+        self._link.command(command.armed, sticks)
 
     # -- from it -----------------------------------------------------------------------------------------------------
 
@@ -144,7 +146,7 @@ class Betaflight(Component[BetaflightParameters]):
             self._diagnose(now)
 
     def _reopen(self, now: int, ended: LinkError) -> None:
-        """Start another process that holds the link: what flies follows the next command, and descends without one."""
+        """Start another process that holds the link: what flies follows the next command, and descends without one; on the ground it idles."""
         if 0 <= now - self._opened < REOPEN * NANOSECONDS:
             return
         self._opened = now
@@ -159,7 +161,7 @@ class Betaflight(Component[BetaflightParameters]):
         if self._status is not None and self._status.armed:
             link.turning()
             if self._wanted:
-                link.command(True, self._sticks.channels((0.0, 0.0, 0.0), GRAVITY))
+                link.command(True, self._sticks.channels((0.0, 0.0, 0.0), GRAVITY) if self._lifted else CENTRED)
 
     def _take(self, frame: msp.Frame, now: int) -> None:
         try:

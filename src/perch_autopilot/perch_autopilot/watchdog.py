@@ -1,4 +1,4 @@
-"""What the autopilot receives when commands stop: level, descend, disarm. Without a clock: times are arguments."""
+"""What the autopilot receives when commands stop: level, descend, disarm; on the ground idle, disarm. Without a clock: times are arguments."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ CENTRED = (1500, 1500, 1000, 1500)
 ON, OFF = 1900, 1000  # of a switch [us]
 ARMING = 0.2         # the throttle stays down for this time after arming, as the firmware requires [s]
 STALE_AFTER = 0.04   # a command older than this is not sent; level instead [s]
-DESCEND_AFTER = 0.5  # time without a command until the descent [s]
+DESCEND_AFTER = 0.5  # time without a command until the descent, on the ground until the motors stop [s]
 DISARM_AFTER = 4.0   # ... and until the motors stop, where nobody says otherwise [s]
 DESCENT = 0.9        # thrust of the descent as a share of the weight
+TURN = 100           # of a stick from its centre: a rate that no command at idle has, as it follows the gyroscope [us]
 Channels = tuple[int, ...]
 
 
@@ -23,8 +24,15 @@ class Mode(Enum):
 
     DISARMED = "disarmed"
     FOLLOWING = "following"
+    IDLE = "idle: commands have stopped on the ground"
     LEVEL = "level: commands have stopped"
     DESCENDING = "descending: commands have stopped"
+
+
+def lifts(sticks: Channels, hover: int) -> bool:
+    """Whether sticks ask for lift: for more than half of the throttle of a hover, or for a turn [us]."""
+    roll, pitch, throttle, yaw = sticks
+    return 2 * (throttle - CENTRED[2]) > hover - CENTRED[2] or max(abs(stick - CENTRED[0]) for stick in (roll, pitch, yaw)) > TURN
 
 
 class Watchdog:
@@ -50,6 +58,7 @@ class Watchdog:
         self._sticks: Channels = CENTRED
         self._wanted, self._came, self._since = False, 0.0, -1e9
         self.begun = self._turning = False
+        self._lifted = False  # a command since arming has asked for lift
         self._locked = False  # the motors were stopped: only a command to disarm allows arming again
 
     def set_throttles(self, hover: int, descent: int) -> None:
@@ -80,6 +89,7 @@ class Watchdog:
             self._since = now
         self._wanted, self._came, self._sticks = armed, now, sticks
         self.begun, self._turning = True, False
+        self._lifted = armed and (self._lifted or lifts(sticks, self._hover))
         self._locked = self._locked and armed
 
     def channels(self, now: float) -> Channels:
@@ -90,7 +100,10 @@ class Watchdog:
         elif age <= STALE_AFTER:
             self.mode = Mode.FOLLOWING
             return (*(self._sticks if now - self._since >= self._arming else CENTRED), ON, OFF)
-        elif age <= self._disarm_after:
+        elif not self._lifted and age <= DESCEND_AFTER:
+            self.mode = Mode.IDLE
+            return (*CENTRED, ON, OFF)
+        elif self._lifted and age <= self._disarm_after:
             self.mode = Mode.LEVEL if age <= DESCEND_AFTER else Mode.DESCENDING
             throttle = self._hover if self.mode is Mode.LEVEL else self._descent
             if self._curves and 0.0 <= now - self._seen <= FRESH and tilt(self._up) > FAR:
