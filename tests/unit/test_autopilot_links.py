@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import signal
 import socket
+import struct
 import time
 from collections.abc import Iterator
 
@@ -44,6 +46,27 @@ def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
             link.read(1.0)
     finally:
         link.close()
+
+
+def test_a_full_port_gets_whole_frames_or_none():
+    ours, theirs = pty.openpty()
+    link, got, last = Link(os.ttyname(theirs)), b"", time.monotonic() + 60.0
+    for k in range(5000):
+        link.write(msp.request(msp.SET_RAW_RC, struct.pack("<I", k) + bytes(29)))
+        if k % 1000 == 999:
+            got += os.read(ours, 1 << 16)
+    while not got.endswith(msp.request(msp.STATUS)) and time.monotonic() < last:  # what is left of the last frame goes first
+        link.write(msp.request(msp.STATUS))
+        if select.select([ours], [], [], 0.1)[0]:
+            got += os.read(ours, 1 << 16)
+    parser = msp.Parser()
+    frames = parser.feed(got.replace(b"$M<", b"$M>"))
+    numbers = [struct.unpack_from("<I", frame.payload)[0] for frame in frames if frame.command == msp.SET_RAW_RC]
+    assert parser.torn == parser.skipped == 0 and frames[-1].command == msp.STATUS
+    assert 100 < len(numbers) < 5000 and numbers == sorted(set(numbers))
+    link.close()
+    os.close(theirs)
+    os.close(ours)
 
 
 def test_the_supervisor_sends_without_commands_reopens_the_link_and_ends_with_the_motors_off():

@@ -157,6 +157,16 @@ def test_odometry_has_the_hosts_time_and_says_what_it_lacks(autopilot):
     assert (other.vx, other.vy, other.vz) == (0.0, 0.0, 0.0) and one.pose_covariance[0] == 1.0
 
 
+def test_odometry_is_sent_at_50_hz_also_after_its_time_has_gone_back(autopilot):
+    P, m = np.eye(6), autopilot.mavlink
+    for start in (100 * SECOND, 0):
+        autopilot.heard()
+        for k in range(500):
+            autopilot.node.on_odometry(OdometryState(start + 2_000_000 * k, (0.0,) * 3, (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, P, P))
+        said = [message.time_usec for message in m.parse_buffer(autopilot.link.recv(1 << 20)) if message.get_type() == "ODOMETRY"]
+        assert len(said) == 50 and set(np.diff(said)) == {20_000}
+
+
 def test_imu_comes_in_by_the_hosts_clock_and_torn_frames_are_counted(autopilot):
     m = autopilot.mavlink
     imu = m.highres_imu_encode(5_000_000, 1.0, 2.0, -9.81, 0.1, 0.2, 0.3, 0, 0, 0, 0, 0, 0, 0, 63)

@@ -34,6 +34,7 @@ class Link:
         Raises:
             LinkError: it cannot be opened.
         """
+        self._rest = b""  # of a frame that the port has accepted in part
         self._sockets: tuple[socket.socket, ...] = ()
         try:
             if found := re.fullmatch(r"tcp:([^:]+):(\d+)", address):
@@ -48,13 +49,16 @@ class Link:
             raise LinkError(f"{address}: cannot be opened: {getattr(error, 'strerror', None) or error}") from None
 
     def write(self, data: bytes) -> None:
-        """Send; what the port cannot accept now is dropped, because a late command would be worse.
+        """Send a frame, whole or not at all: while the port is full it is dropped, because a late command would be worse.
 
         Raises:
             LinkError: it has ended.
         """
         try:
-            os.write(self.file, data)
+            if self._rest:
+                self._rest = self._rest[os.write(self.file, self._rest):]
+            if not self._rest:
+                self._rest = data[os.write(self.file, data):]
         except BlockingIOError:
             pass
         except OSError as error:

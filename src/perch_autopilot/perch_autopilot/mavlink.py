@@ -32,6 +32,7 @@ _JUMPED = 3                          # samples in a row that do not follow the l
 _STALE = 100_000_000                 # a command that is older is not sent any more [ns]
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
 _COMMANDS = {176: "the mode", 400: "arming"}
+_ODOMETRY_PERIOD = NANOSECONDS // 50  # odometry is sent no more often: at 500 Hz it alone, 240 bytes each, would fill 921600 baud [ns]
 _IGNORE_ATTITUDE = 128               # of SET_ATTITUDE_TARGET's type_mask: rates and thrust count
 
 
@@ -101,6 +102,7 @@ class Mavlink(Component[MavlinkParameters]):
         self._command: RatesThrust | None = None
         self._now: int | None = None         # of the last poll [ns]
         self._begun = self._came = self._second = self._opened = self._torn = self._named = self._jumps = 0
+        self._sent: int | None = None        # stamp of the last odometry that was sent [ns]
         self._sampled: int | None = None     # stamp of its last sample, by its own clock [ns]
         try:
             self._identify(link)
@@ -128,7 +130,10 @@ class Mavlink(Component[MavlinkParameters]):
         self._command, self._came = command, self._now or 0
 
     def on_odometry(self, state: OdometryState) -> None:
-        """On to the autopilot's own estimator, in its axes, by the host's clock, which it knows by TIMESYNC."""
+        """On to the autopilot's own estimator, in its axes, by the host's clock, which it knows by TIMESYNC; at 50 Hz at most."""
+        if self._sent is not None and 0 <= state.stamp - self._sent < _ODOMETRY_PERIOD:
+            return
+        self._sent = state.stamp
         mavlink = self._mavlink
         x, y, z = frames.world(state.p_WB)
         measured = state.twist_covariance[0, 0] >= 0.0
