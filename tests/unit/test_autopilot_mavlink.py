@@ -311,11 +311,36 @@ def test_a_link_that_has_ended_is_opened_anew(autopilot, monkeypatch):
     autopilot.link = theirs
     said = autopilot.heard(2.0)
     assert len(tried) == 3 and min(np.diff(tried)) >= 0.2 * SECOND
-    assert {"HEARTBEAT", "TIMESYNC"} <= set(said) and autopilot.node.offboard == Offboard()  # nothing is known of who is there now
+    assert {"HEARTBEAT", "TIMESYNC"} <= set(said) and autopilot.node.offboard == Offboard(PX4)  # its state is unknown
     autopilot.say(autopilot.mavlink.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
     autopilot.heard()
     assert autopilot.node.offboard.following
     assert [line.text for line in autopilot.got["log"][:2]] == ["the link to the autopilot has ended", f"{autopilot.node.config.link}: cannot be opened"]
+
+
+@pytest.mark.parametrize("options", [None, 0.0, 8.0])
+def test_a_link_that_is_opened_anew_gives_ardupilot_set_points_as_before(options, monkeypatch):
+    """None or all, also before its first heartbeat and its parameter have come again."""
+    autopilot = Autopilot(ARDUPILOT)
+    m = autopilot.mavlink
+    if options is not None:
+        autopilot.say(m.param_value_encode(b"GUID_OPTIONS", options, 6, 1, 0))
+    autopilot.heard()
+    ours, theirs = socket.socketpair()
+    monkeypatch.setattr("perch_autopilot.mavlink.Link", lambda _: Link(f"fd:{ours.detach()}"))
+    autopilot.link.close()
+    autopilot.link = theirs
+    try:
+        autopilot.heard(0.3)
+        for begun in (False, True):
+            if begun:
+                autopilot.say(m.heartbeat_encode(2, ARDUPILOT, ARMED, GUIDED_NOGPS, 4))
+            for _ in range(20):
+                autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+                assert ("SET_ATTITUDE_TARGET" in autopilot.heard()) == (options == 8.0)
+    finally:
+        autopilot.node.close()
+        autopilot.link.close()
 
 
 @pytest.mark.parametrize("noise, words", [(b"", "check its power, link and system id"), (b"\x00\xf8\x06" * 9, "is the baud rate right?")])

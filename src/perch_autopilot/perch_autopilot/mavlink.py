@@ -199,10 +199,11 @@ class Mavlink(Component[MavlinkParameters]):
             return b""
 
     def _lose(self, error: LinkError) -> None:
-        """The link has ended: at its next beginning nothing is known of the autopilot."""
+        """The link has ended: at its next beginning only the autopilot's kind and options are known."""
         self.log(LogLine("error", str(error), 1.0))
         self.close()
-        self.offboard, self._clock, self._sampled = Offboard(), ClockOffset(), None
+        self.offboard = Offboard(self.offboard.autopilot, options=self.offboard.options)
+        self._clock, self._sampled = ClockOffset(), None
 
     def _order(self, command: int, *words: float) -> None:
         self._send(self._mavlink.command_long_encode(self.config.system, 1, command, 0, *words, *(0.0,) * (7 - len(words))))

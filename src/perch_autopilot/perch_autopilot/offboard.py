@@ -56,7 +56,7 @@ class Offboard:
     @property
     def takes_thrust(self) -> bool:
         """Whether it takes a set point's thrust as a thrust, not as a climb rate."""
-        return self.autopilot != ARDUPILOT or bool(self.options & THRUST_AS_THRUST)
+        return self.autopilot == PX4 or (self.autopilot == ARDUPILOT and bool(self.options & THRUST_AS_THRUST))
 
     def alive(self, now: float) -> bool:
         """Whether its heartbeat is of the present."""
