@@ -19,7 +19,7 @@ from perch_autopilot.mavlink import Mavlink, MavlinkParameters
 from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rate_curve import RateCurve
 from perch_autopilot.rates import Sticks, rate_curves
-from perch_autopilot.watchdog import OFF, ON, Mode, Watchdog
+from perch_autopilot.watchdog import CENTRED, OFF, ON, Mode, Watchdog
 from perch_autopilot.link import LinkError
 from perch_core.config import config_dir
 from perch_core.errors import ConfigError
@@ -265,7 +265,8 @@ def test_a_process_that_holds_the_link_and_ends_is_replaced(armed, thrust, flown
     last.ended = True
     assert polled(node, 1.5, 10) == ["the process that holds the link has ended: another one is started"]
     assert StubAutopilot.opened == opened + 1 and last.closed and not node._link.closed
-    assert node._link.told == (["turning", (True, node._sticks.channels((0.0, 0.0, 0.0), thrust))] if armed else [])
+    command = (True, node._sticks.channels((0.0, 0.0, 0.0), thrust))
+    assert node._link.told == ([] if not armed else ["turning", command] if thrust else [command])
     for k in range(100):
         node._link.ended = True
         node.on_poll(round(1.6e9) + k * 10_000_000)
@@ -371,6 +372,13 @@ def test_of_what_flies_already_the_throttle_does_not_come_down():
     dog.command(5.1, False, STICKS)
     dog.command(5.2, True, STICKS)
     assert dog.channels(5.2) == (1500, 1500, 1000, 1500, ON, OFF)
+
+
+def test_what_was_armed_before_the_first_command_is_taken_to_fly():
+    dog = Watchdog(hover=1450, descent=1420)
+    dog.turning()
+    dog.command(5.0, True, CENTRED)
+    assert dog.channels(5.1)[2] == 1450
 
 
 def test_a_fresh_command_goes_on_and_a_stale_one_never_does():

@@ -68,7 +68,8 @@ class Betaflight(Component[BetaflightParameters]):
         self._attitude: tuple[float, float, float] | None = None
         self._battery: msp.Battery | None = None
         self._wanted_since: int | None = None   # the host's time since which it has been told to arm without doing so [ns]
-        self._wanted = self._lifted = False     # it shall turn its motors; a command since arming has asked for lift
+        self._wanted = False                    # it shall turn its motors
+        self._lifted = self._status is not None and self._status.armed  # a command since arming has asked for lift; found armed, it may fly
         self._now: int | None = None            # of the last poll [ns]
         self._answered = self._diagnosed = self._opened = self._torn = 0
 
@@ -159,7 +160,8 @@ class Betaflight(Component[BetaflightParameters]):
         self._link.close()
         self._link = link
         if self._status is not None and self._status.armed:
-            link.turning()
+            if self._lifted or not self._wanted:
+                link.turning()
             if self._wanted:
                 link.command(True, self._sticks.channels((0.0, 0.0, 0.0), GRAVITY) if self._lifted else CENTRED)
 

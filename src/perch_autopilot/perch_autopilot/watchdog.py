@@ -74,8 +74,8 @@ class Watchdog:
         return bool(self._curves) and self._wanted and now - self._came > 0.5 * STALE_AFTER
 
     def turning(self) -> None:
-        """The motors turn before the first command, whose throttle therefore follows at once."""
-        self._turning = True
+        """The motors turn before the first command, whose throttle therefore follows at once; it may fly."""
+        self._turning = self._lifted = True
 
     def command(self, now: float, armed: bool, sticks: Channels) -> None:
         """Take a command.
