@@ -22,10 +22,11 @@ Q_PERCH = so3.quat_from_matrix(SURFACE.R_WS)
 class World:
     """What the mission sees: a controller that obeys, a pad that is visible or not, velcro that holds or not."""
 
-    def __init__(self, sees=True, plans=True, sticks=True, stays=True, recovers=True, ready=True, detour=0.0):
+    def __init__(self, sees=True, plans=True, sticks=True, stays=True, recovers=True, ready=True, detour=0.0, takes=True):
         self.detour, self.flown = detour, []  # what a new plan's contact is late by [s]; starts and durations of perches
         self.sees, self.plans, self.sticks, self.stays, self.recovers, self.ready = sees, plans, sticks, stays, recovers, ready
         self.machine = SurfaceMission(MissionSettings())
+        self.takes, self.due = takes, None  # whether the controller takes perches; start and id of the one that waits
         self.deaf = 0  # so many commands to arm are lost
         self.time, self.p, self.q = 0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         self.controller, self.trajectory_id = ControllerState.DISARMED, 0
@@ -45,6 +46,8 @@ class World:
         assert self.time < 1000.0, f"what is waited for does not come: {self.machine.phase}, {self.machine.message}"
         if self.reference is not None and self.time >= self.reference.start_time:
             self.p = self.reference.sample(self.time - self.reference.start_time).p
+        if self.due is not None and self.time >= self.due[0]:
+            self.controller, self.trajectory_id, self.due = ControllerState.TRACKING, self.due[1], None
         if self.perch_end is not None and self.time >= self.perch_end:
             self.p, self.q, self.stuck = SURFACE.p_WS, Q_PERCH, self.sticks
             if not self.sticks and self.time > self.perch_end + 0.25 and self.recovers:
@@ -70,7 +73,7 @@ class World:
             elif command is Command.ARM:
                 self.controller = ControllerState.ARMED
             elif command is Command.HOVER:
-                self.controller, self.hover_at, self.perch_end = ControllerState.RECOVERING, self.time + 1.0, None
+                self.controller, self.hover_at, self.perch_end, self.due = ControllerState.RECOVERING, self.time + 1.0, None, None
                 self.q, self.off_at = np.array([0.0, 0.0, 0.0, 1.0]), None
             elif command is Command.ATTACHED:
                 self.controller, self.off_at = ControllerState.ATTACHED, self.time
@@ -80,7 +83,10 @@ class World:
             self.reference, self.controller, self.trajectory_id = out.reference, ControllerState.TRACKING, out.trajectory_id
         if out.perch is not None:
             self.flown.append((out.perch.start_time, out.perch.duration))
-            self.reference, self.perch_end, self.trajectory_id = None, out.perch.start_time + out.perch.duration, out.trajectory_id
+            if not self.takes:
+                self.controller = ControllerState.HOVERING
+            elif self.controller in (ControllerState.TRACKING, ControllerState.HOVERING):
+                self.reference, self.perch_end, self.due = None, out.perch.start_time + out.perch.duration, (out.perch.start_time, out.trajectory_id)
         if out.query is not None:
             self.query, self.queries = out.query, self.queries + 1
         self.outcome = out.outcome or self.outcome
@@ -97,10 +103,15 @@ class World:
         return phases
 
 
-def reached(phase: Phase, attempts: int = 1) -> World:
+    def recover(self):
+        """The controller leaves what it flies, for a hover."""
+        self.controller, self.hover_at, self.perch_end, self.due = ControllerState.RECOVERING, self.time + 0.5, None, None
+
+
+def reached(phase: Phase, attempts: int = 1, replan: bool = False) -> World:
     """A goal that has come to a phase."""
     world = World()
-    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0, attempts=attempts), world.time)
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0, attempts=attempts, replan=replan), world.time)
     while world.machine.phase is not phase:
         world.tick()
     return world
@@ -253,12 +264,34 @@ def test_a_cancel_does_not_undo_a_landing():
     assert world.outcome.result is Result.CANCELLED and Command.HOVER not in world.commands
 
 
-def test_a_perch_that_was_given_up_before_the_contact_is_not_flown_again():
-    world = reached(Phase.TRACKING, attempts=2)
-    world.controller, world.hover_at, world.perch_end = ControllerState.RECOVERING, world.time + 0.5, None
+@pytest.mark.parametrize("phase", [Phase.TRACKING, Phase.VERIFYING])
+def test_a_perch_that_was_given_up_before_the_contact_is_not_flown_again(phase):
+    world = reached(phase, attempts=2)
+    world.recover()
     while world.outcome is None:
         world.tick()
     assert world.outcome.result is Result.MISSED and "given up" in world.outcome.message and world.queries == 1
+
+
+@pytest.mark.parametrize("state", [ControllerState.RECOVERING, ControllerState.HOVERING])
+def test_no_new_plan_undoes_an_abort_while_one_waits_for_its_start(state):
+    world = reached(Phase.TRACKING, attempts=2, replan=True)
+    while len(world.flown) < 3 or world.due is None:
+        world.tick()
+    world.recover()
+    world.controller, flown, queries = state, len(world.flown), world.queries
+    while world.outcome is None:
+        world.tick()
+    assert world.outcome.result is Result.MISSED and "given up: says so" in world.outcome.message
+    assert (len(world.flown), world.queries) == (flown, queries)
+
+
+@pytest.mark.parametrize("replan", [False, True])
+def test_a_plan_that_the_controller_does_not_take_ends_the_goal(replan):
+    world = World(takes=False)
+    world.run(Goal(takeoff_height=1.2, search_timeout=6.0, attempts=2, replan=replan))
+    assert world.outcome.result is Result.REFUSED and world.outcome.message.endswith("not taken the plan: says so")
+    assert world.time < world.flown[0][0] + 0.3 and world.commands == [Command.ARM, Command.HOVER]
 
 
 def test_a_perch_holds_only_with_a_controller_that_is_attached():

@@ -159,13 +159,16 @@ def test_a_plan_is_asked_for_with_the_thrust_that_the_controller_has_found(ratio
     assert world.requests[0][0].thrust_ratio == ratio
 
 
-def test_a_late_answer_is_used_when_it_comes():
+def test_a_late_answer_is_flown_from_when_it_comes():
     world = World(planner=lambda request: None).send().run(until=lambda w: w.requests)
-    world.run(0.5)
+    world.run(0.9)
     assert world.phase == "planning"
     world.plan(world.requests[0][0])
+    answered, request = seconds(world.stamp), world.requests[0][0]
     world.run()
-    assert world.goal.ending == "succeeded"
+    trajectory = world.orders[-1].trajectory
+    assert world.goal.ending == "succeeded" and seconds(request.start) < answered < trajectory.start_time < answered + 0.1
+    assert world.goal.result.contact_time > trajectory.start_time + trajectory.duration
 
 
 @pytest.mark.parametrize("answer, said", [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -55,14 +54,12 @@ class Departure(MissionMachine):
         return PlanQuery(start, x.p_WB, zero, zero, zero, 0.0, wire, self._goal, latency, state=still, recovery=True)
 
     def _fly(self, inputs: Inputs, outputs: Outputs, plan: Plan | Refusal) -> None:
-        """A vehicle at rest may begin its plan at any time: at once."""
+        """At once."""
         if isinstance(plan, Refusal):
             self.message = f"no plan to leave the wire: {plan.message}"
             outputs.commands.append((Command.ARM, "departing"))
             return
-        start = inputs.time + LEAD
-        outputs.perch = replace(plan, trajectory=replace(plan.trajectory, start_time=start))
-        outputs.trajectory_id = self._new_id()
+        outputs.perch, outputs.trajectory_id = plan.starting(inputs.time + LEAD), self._new_id()
 
     def _recovered(self, inputs: Inputs, outputs: Outputs) -> None:
         self._end(outputs, Result.PERCHED, "departed; hovering")

@@ -9,9 +9,11 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from perch_control.mission.machine import MissionMachine
-from perch_control.mission.moves import Moves
+from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
+
+TAKEN = 0.2  # a controller that still hovers so long after a plan's start has not taken it [s]
 
 
 class InFlight(Protocol):
@@ -30,8 +32,10 @@ R = TypeVar("R", bound=InFlight)
 class PerchingMission(MissionMachine, Generic[R]):
     """What perches on surfaces and on wires share. R: what is known of the plan in flight."""
 
-    _target: Target  # from the query on
-    _running: R      # from the first trajectory on
+    _target: Target      # from the query on
+    _running: R          # from the first trajectory on
+    _first_id: int       # of an attempt's first trajectory; ids grow
+    _first_start: float  # when that starts [s]
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         super().__init__(settings, ids, moves)
@@ -86,16 +90,23 @@ class PerchingMission(MissionMachine, Generic[R]):
         if isinstance(inputs.plan, Refusal):
             self._end(outputs, Result.REFUSED, f"planner refused: {inputs.plan.message}")
             return
-        self._fly(self.running(inputs.plan, self._target), outputs)
-        self._enter(Phase.TRACKING, inputs.time, f"perching, {inputs.plan.duration:.2f} s")
+        plan = inputs.plan if inputs.plan.start_time > inputs.time else inputs.plan.starting(inputs.time + LEAD)  # the hover lasts
+        self._fly(self.running(plan, self._target), outputs)
+        self._first_id, self._first_start = self._flown_id, plan.start_time
+        self._enter(Phase.TRACKING, inputs.time, f"perching, {plan.duration:.2f} s")
 
     def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
         end = self._running.plan.end
         self.time_to_contact = end - inputs.time
         if self._descends(inputs, outputs):
             return
-        if inputs.trajectory_id == self._flown_id and inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
+        hovers = inputs.controller is ControllerState.HOVERING
+        if inputs.controller is ControllerState.RECOVERING or hovers and inputs.trajectory_id >= self._first_id:
             self._gave_up(inputs, f"perch given up: {inputs.controller_message}")
+            return
+        if hovers and inputs.time > self._first_start + TAKEN:
+            outputs.commands.append((Command.HOVER, "the plan was not taken"))  # nor later
+            self._end(outputs, Result.REFUSED, f"the controller has not taken the plan: {inputs.controller_message}")
             return
         self.better(inputs, outputs)
         if inputs.time > end - self.settings.contact_early:
@@ -112,7 +123,10 @@ class PerchingMission(MissionMachine, Generic[R]):
         elif self._descends(inputs, outputs):
             pass
         elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
-            self._missed(inputs, f"no adhesion: {inputs.controller_message}")
+            if inputs.time < self._running.plan.end:
+                self._gave_up(inputs, f"perch given up: {inputs.controller_message}")
+            else:
+                self._missed(inputs, f"no adhesion: {inputs.controller_message}")
         elif not self.waiting(inputs, outputs):
             self.not_held(outputs)
             self._missed(inputs, "no adhesion")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
 import numpy as np
@@ -175,6 +175,10 @@ class Plan:
     def end(self) -> float:
         """Time of the planned contact [s]."""
         return self.start_time + self.duration
+
+    def starting(self, time: float) -> Plan:
+        """The same from another time on [s]: a vehicle at rest may begin at any time."""
+        return replace(self, trajectory=replace(self.trajectory, start_time=time))
 
 
 @dataclass(frozen=True)
