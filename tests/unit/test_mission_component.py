@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from perch_control.mission.parameters import MissionParameters
+from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Result
 from perch_control.mission_component import Mission
 from perch_core import so3
@@ -62,6 +63,13 @@ class World:
 
     def plan(self, request):
         path = rest_to_rest(request.p, SURFACE.p_WS, 0.0, 0.0, 1.2, start_time=seconds(request.start))
+        self.mission.on_plan_perch(PerchPlan(success=True, message="found", trajectory=path))
+
+    def replan(self, request):
+        """The rest of what is flown, in the time that is left."""
+        start, duration = seconds(request.start), request.segment_times[0] if request.segment_times else 1.2
+        p = request.p if request.current is None else request.current.sample(start - request.current.start_time).p
+        path = rest_to_rest(p, SURFACE.p_WS, 0.0, 0.0, duration, start_time=start)
         self.mission.on_plan_perch(PerchPlan(success=True, message="found", trajectory=path))
 
     def fly(self, order):
@@ -149,6 +157,19 @@ def test_an_answer_counts_from_its_due_time_on():
     world.run(until=lambda w: len(w.orders) > orders)
     assert world.stamp - TICK == due, "the answer was there at once"
     assert seconds(request.start) == world.orders[-1].trajectory.start_time
+
+
+@pytest.mark.parametrize("latency", [0.04, 0.15, 0.25])
+def test_new_plans_are_flown_however_long_a_plan_takes(latency):
+    world = World(params=MissionParameters(mission=MissionSettings(planner_latency=latency)), replan=True)
+    world.planner = world.replan
+    world.send().run()
+    perches = [order.trajectory for order in world.orders if order.at_end]
+    assert world.goal.ending == "succeeded" and len(perches) > 2
+    ends = [path.start_time + path.duration for path in perches]
+    assert ends == pytest.approx([ends[0]] * len(ends), abs=1e-6)
+    dues = [due for _, due in world.requests]
+    assert np.diff(dues).min() >= latency * NANOSECONDS - 1, "one at a time"
 
 
 @pytest.mark.parametrize("ratio", [0.83, 0.0])

@@ -13,6 +13,7 @@ class SurfaceMission(PerchingMission[RunningPerch]):
 
     unseen = "no tags seen"
     _asked_way_out: tuple[PlanQuery, WaysOut] | None = None
+    _asked_again = False  # a new plan has been asked for, and not answered
 
     @property
     def latency(self) -> float:
@@ -20,7 +21,8 @@ class SurfaceMission(PerchingMission[RunningPerch]):
         return self.settings.planner_latency
 
     def running(self, plan: Plan, target: Target) -> RunningPerch:
-        """A plan in flight."""
+        """A plan in flight. What was asked in an attempt before no longer counts."""
+        self._asked_way_out, self._asked_again = None, False
         return RunningPerch.begun(plan, target, self.settings)
 
     def better(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -40,16 +42,20 @@ class SurfaceMission(PerchingMission[RunningPerch]):
 
     def _plan_again(self, inputs: Inputs, outputs: Outputs) -> None:
         """Continue from the running plan's future to the target as it is seen now (M's future work)."""
+        if inputs.plan is not None:
+            self._asked_again = False
         better = self._running.better(inputs.plan, inputs.time, self.settings)
         if better is not None:
             if better is not self._running:
                 self._fly_better(better, outputs)
                 outputs.way_out = None  # of the plan before
             return
+        if self._asked_again:
+            return
         start = inputs.time + self.settings.lead(self.latency)
         asked = self._running.query(inputs.time, self._usable_now(inputs)[0], self._goal, self.settings, start, self.latency)
         if asked is not None:
-            self._running, outputs.query = asked
+            (self._running, outputs.query), self._asked_again = asked, True
 
     def not_held(self, outputs: Outputs) -> None:
         """Stop: the trajectory has no way on."""
