@@ -8,10 +8,12 @@ import pytest
 from perch_core import so3
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import rest_to_rest
+from perch_core.values import MappedPowerline
 from perch_core.vehicle import GRAVITY
 from perch_control.mission import (
     AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Phase,
     Plan, Refusal, Result, State, SurfaceMission, Target)
+from perch_control.mission.departure import Departure
 from perch_control.mission.moves import Moves
 
 TICK = 0.02
@@ -31,7 +33,7 @@ class World:
         self.time, self.p, self.q = 0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         self.controller, self.trajectory_id = ControllerState.DISARMED, 0
         self.reference = self.perch_end = self.query = None
-        self.stuck, self.off_at, self.commands, self.outcome, self.queries = False, None, [], None, 0
+        self.stuck, self.off_at, self.commands, self.outcome, self.queries, self.ways_out_asked = False, None, [], None, 0, 0
 
     def force(self):
         """Specific force in B: carried at rest, by thrust alone on the perch, by nothing with motors off in the air."""
@@ -70,9 +72,11 @@ class World:
             self.commands.append(command)
             if command is Command.ARM and self.deaf:
                 self.deaf -= 1
+            elif command is Command.ARM and self.controller is ControllerState.ATTACHED:
+                self.controller, self.hover_at = ControllerState.RECOVERING, self.time + 1.0
             elif command is Command.ARM:
                 self.controller = ControllerState.ARMED
-            elif command is Command.HOVER:
+            elif command is Command.HOVER and self.controller is not ControllerState.ATTACHED:
                 self.controller, self.hover_at, self.perch_end, self.due = ControllerState.RECOVERING, self.time + 1.0, None, None
                 self.q, self.off_at = np.array([0.0, 0.0, 0.0, 1.0]), None
             elif command is Command.ATTACHED:
@@ -90,6 +94,7 @@ class World:
         if out.query is not None:
             self.query, self.queries = out.query, self.queries + 1
         self.outcome = out.outcome or self.outcome
+        self.ways_out_asked += out.way_out_query is not None
         self.time += TICK
         return out
 
@@ -191,6 +196,7 @@ def test_a_second_attempt_is_flown():
     world = World(sticks=False)
     world.run(Goal(takeoff_height=1.2, search_timeout=6.0, attempts=2))
     assert world.queries == 2 and world.outcome.result is Result.MISSED
+    assert world.ways_out_asked == 2, "in the second attempt too, though the first query was never answered"
 
 
 def test_coming_off_after_the_motors_stopped_is_noticed():
@@ -198,6 +204,39 @@ def test_coming_off_after_the_motors_stopped_is_noticed():
     world.run()
     assert world.commands == [Command.ARM, Command.ATTACHED, Command.ARM, Command.HOVER]
     assert world.outcome.result is Result.MISSED
+
+
+def test_a_vehicle_that_comes_off_is_armed_until_the_controller_flies():
+    world = World(stays=False)
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    while world.machine.phase is not Phase.PERCHED:
+        world.tick()
+    world.deaf = 3
+    while world.outcome is None:
+        world.tick()
+    assert world.commands == [Command.ARM, Command.ATTACHED] + 4 * [Command.ARM, Command.HOVER]
+    assert world.outcome.result is Result.MISSED and world.controller is ControllerState.HOVERING
+
+
+WIRE = Target(0.0, SURFACE.p_WS, Q_PERCH, 0.01, 0.01, (MappedPowerline(4, (1.7, -2.0, 1.2), (1.7, 2.0, 1.2), 0.01, 1e-4 * np.eye(3), 0.01, 30),), 4)
+
+
+@pytest.mark.parametrize("cancel_in", [None, Phase.PERCHED])
+def test_what_was_perched_on_last_is_left_by_its_own_way(cancel_in):
+    world, moves = World(), Moves(MissionSettings())
+    moves.wire = WIRE  # of the perch before
+    world.machine = SurfaceMission(MissionSettings(), moves=moves)
+    world.run(cancel_in=cancel_in)
+    assert world.controller is ControllerState.ATTACHED and moves.wire is None
+
+
+def test_a_departure_without_a_plan_arms_until_the_controller_does():
+    world, moves = World(plans=False), Moves(MissionSettings())
+    world.controller, moves.wire, world.deaf = ControllerState.ATTACHED, WIRE, 2
+    world.machine = Departure(MissionSettings(), moves=moves)
+    world.run(seconds=15.0)
+    assert world.outcome.result is Result.PERCHED and world.controller is ControllerState.HOVERING
+    assert world.commands == 3 * [Command.ARM] and world.queries == 1
 
 
 def test_no_target_ends_in_a_hover_after_the_pattern():

@@ -21,6 +21,8 @@ class Departure(MissionMachine):
     controller's recovery along the surface's normal. Either starts the motors, which opens what holds the vehicle.
     """
 
+    _no_plan = False  # the planner has refused
+
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         super().__init__(settings, ids, moves)
         self.phases = {Phase.ARMING: self._leaving, Phase.RECOVERING: self._recovering}
@@ -40,7 +42,7 @@ class Departure(MissionMachine):
         elif self._elapsed(inputs) > self.settings.phase_timeout:
             why = inputs.controller_message if inputs.estimator_ready else "the estimator is not ready"
             self._end(outputs, Result.TIMEOUT, f"no departure within {self.settings.phase_timeout:g} s: {why}")
-        elif inputs.estimator_ready and (wire := self._moves.wire) is not None:
+        elif inputs.estimator_ready and not self._no_plan and (wire := self._moves.wire) is not None:
             if self._asked_at is None:
                 self._asked_at, outputs.query = inputs.time, self._way_out(inputs, wire)
         elif inputs.estimator_ready and self._time_to_ask(inputs):
@@ -58,6 +60,7 @@ class Departure(MissionMachine):
         if isinstance(plan, Refusal):
             self.message = f"no plan to leave the wire: {plan.message}"
             outputs.commands.append((Command.ARM, "departing"))
+            self._no_plan, self._asked_at = True, inputs.time
             return
         outputs.perch, outputs.trajectory_id = plan.starting(inputs.time + LEAD), self._new_id()
 

@@ -36,6 +36,7 @@ class PerchingMission(MissionMachine, Generic[R]):
     _running: R          # from the first trajectory on
     _first_id: int       # of an attempt's first trajectory; ids grow
     _first_start: float  # when that starts [s]
+    _off = False         # the vehicle came off after the motors had stopped
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         super().__init__(settings, ids, moves)
@@ -133,15 +134,29 @@ class PerchingMission(MissionMachine, Generic[R]):
 
     def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
         if self._adhesion.fallen_off(inputs.state):
-            outputs.commands.append((Command.ARM, "came off the surface"))
-            outputs.commands.append((Command.HOVER, "came off the surface"))
+            self._off = True
+            self._motors_on(outputs)
             self._missed(inputs, "came off the surface after the motors stopped")
         elif self._elapsed(inputs) > self.settings.rest_time and inputs.controller is not ControllerState.ATTACHED:
             self._end(outputs, Result.TRACKING_LOST, f"the controller is not attached: {inputs.controller_message}")
         elif self._elapsed(inputs) > self.settings.rest_time:
             result, words = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
-            self._moves.wire = self._running.target if self._running.target.lines else None
             self._end(outputs, result, f"{words}perched", contact_time=self._contact_time)
+
+    def _motors_on(self, outputs: Outputs) -> None:
+        """Nothing carries the vehicle any more."""
+        outputs.commands += [(Command.ARM, "came off the surface"), (Command.HOVER, "came off the surface")]
+
+    def _recovering(self, inputs: Inputs, outputs: Outputs) -> None:
+        super()._recovering(inputs, outputs)
+        if self._off and self.phase is Phase.RECOVERING and inputs.controller is ControllerState.ATTACHED:
+            self._motors_on(outputs)  # the commands before were lost, or refused for a moment
+
+    def _enter(self, phase: Phase, time: float, message: str) -> None:
+        super()._enter(phase, time, message)
+        self._off = self._off and phase is Phase.RECOVERING
+        if phase is Phase.PERCHED:  # however the goal ends, this is what carries the vehicle
+            self._moves.wire = self._running.target if self._running.target.lines else None
 
     # -- plans in flight ---------------------------------------------------------------------------------------------
 
