@@ -53,7 +53,7 @@ class Departure(MissionMachine):
         zero, x, latency = np.zeros(3), inputs.state, self.settings.powerline_latency
         start = inputs.time + self.settings.lead(latency)
         still = StateSample(p=x.p_WB, q=x.q_WB, v=zero, w=zero, a=zero, dw=zero, rotor_thrust=np.full(4, _THRUST))
-        return PlanQuery(start, x.p_WB, zero, zero, zero, 0.0, wire, self._goal, latency, state=still, recovery=True)
+        return PlanQuery(start, x.p_WB, zero, 0.0, wire, self._goal, latency, state=still, recovery=True)
 
     def _fly(self, inputs: Inputs, outputs: Outputs, plan: Plan | Refusal) -> None:
         """At once."""

@@ -75,10 +75,9 @@ class PerchingMission(MissionMachine, Generic[R]):
     def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
         """Ask for a plan from the hover."""
         self._target = target
-        zero = np.zeros(3)
         p, yaw = self._moves.hover
         start = inputs.time + self.settings.lead(self.latency)
-        outputs.query = PlanQuery(start, p, zero, zero, zero, yaw, target, self._goal, self.latency)
+        outputs.query = PlanQuery(start, p, np.zeros(3), yaw, target, self._goal, self.latency)
         self._enter(Phase.PLANNING, inputs.time, "planning")
 
     def _planning(self, inputs: Inputs, outputs: Outputs) -> None:

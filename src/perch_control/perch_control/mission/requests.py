@@ -15,7 +15,7 @@ from perch_control.mission.values import Plan, PlanQuery, Refusal
 def perch_request(query: PlanQuery, thrust_ratio: float) -> PerchPlanRequest:
     """The request for a perch on a surface; `thrust_ratio`: as the controller tells it."""
     return PerchPlanRequest(
-        start=nanoseconds(query.start_time), p=query.p, v=query.v, a=query.a, j=query.j, yaw=float(query.yaw), current=query.current,
+        start=nanoseconds(query.start_time), p=query.p, v=query.v, yaw=float(query.yaw), current=query.current,
         p_WS=query.target.p_WS, q_WS=query.target.q_WS, segment_times=() if query.duration is None else (float(query.duration),),
         thrust_ratio=thrust_ratio)
 

@@ -43,7 +43,7 @@ class RunningPerch:
         start, zero = self.ways_out.next(time + settings.planner_latency + DECISION), np.zeros(3)
         if start is None:
             return None
-        return PlanQuery(start, zero, zero, zero, zero, 0.0, self.target, goal, settings.planner_latency, current=self.plan.trajectory, recovery=True)
+        return PlanQuery(start, zero, zero, 0.0, self.target, goal, settings.planner_latency, current=self.plan.trajectory, recovery=True)
 
     def better(self, answer: Plan | Refusal | None, time: float, settings: MissionSettings) -> RunningPerch | None:
         """The plan to fly instead of this one, from the answer to the newest query; None: this one."""
@@ -70,5 +70,5 @@ class RunningPerch:
         if start <= self.plan.start_time or time - self.asked_at < settings.replan_period:
             return None
         zero = np.zeros(3)
-        query = PlanQuery(start, zero, zero, zero, zero, 0.0, target, goal, latency, current=self.plan.trajectory, duration=self.plan.end - start)
+        query = PlanQuery(start, zero, zero, 0.0, target, goal, latency, current=self.plan.trajectory, duration=self.plan.end - start)
         return replace(self, asked=target, asked_at=time), query

@@ -151,7 +151,5 @@ class RunningPlan:
 
     def _ask(self, start: float, x: StateSample, target: Target, goal: Goal, recovery: bool = False,
              perch_pose: tuple[np.ndarray, np.ndarray] | None = None) -> PlanQuery:
-        zero = np.zeros(3)
-        self._asked = PlanQuery(start, x.p, x.v, zero, zero, 0.0, target, goal, latency=AHEAD_LATENCY,
-                                state=x, recovery=recovery, perch_pose=perch_pose)
+        self._asked = PlanQuery(start, x.p, x.v, 0.0, target, goal, latency=AHEAD_LATENCY, state=x, recovery=recovery, perch_pose=perch_pose)
         return self._asked

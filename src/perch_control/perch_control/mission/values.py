@@ -123,12 +123,12 @@ class PlanQuery:
 
     Attributes:
         start_time: when the trajectory shall start [s].
-        p, v, a, j: start state in W, shapes (3,).
+        p, v: start position [m] and velocity [m/s] in W, shapes (3,); from there without acceleration.
         yaw: start yaw [rad].
         target: where to perch.
         goal: what was asked for.
         latency: from the request to the use of the plan [s].
-        current: the trajectory being flown, to be continued from `start_time`; None: start from p, v, a, j.
+        current: the trajectory being flown, to be continued from `start_time`; None: start from p, v.
         duration: time from the start to contact [s] that the new plan should keep; None: chosen by the planner.
         state: full state at the start, of a powerline plan that is being flown; None: level, with this yaw.
         recovery: plan the way out alone, from `state`, or from `current` at `start_time`.
@@ -138,8 +138,6 @@ class PlanQuery:
     start_time: float
     p: np.ndarray
     v: np.ndarray
-    a: np.ndarray
-    j: np.ndarray
     yaw: float
     target: Target
     goal: Goal
