@@ -258,8 +258,8 @@ def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):
 @pytest.mark.parametrize("armed, thrust", [(False, 9.81), (True, 9.81), (True, 0.0)])
 def test_a_process_that_holds_the_link_and_ends_is_replaced(armed, thrust, flown_on, monkeypatch):
     """What flies keeps its throttle, and the new process is told of a hover, so that it descends where no command follows; what idles, idles."""
-    monkeypatch.setattr(StubAutopilot, "armed", armed)
     node = flown_on(16.0)
+    monkeypatch.setattr(StubAutopilot, "armed", armed)
     assert polled(node, 1.0, 50, thrust) == []
     last, opened = node._link, StubAutopilot.opened
     last.ended = True

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from perch_control.mission import ControllerState, Goal, InspectionMission, Inputs, MissionSettings, Mode, Phase, Result, State, Target
+from perch_control.mission import ControllerState, Goal, InspectionMission, Inputs, MissionSettings, Phase, Result, State, Target
 from perch_control.mission.waypoints import waypoint_lines
 from perch_control.nmpc import LineWeights, chosen_lines
 from perch_core import config
@@ -90,7 +90,7 @@ def test_a_scenario_says_what_its_nodes_fly():
 def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, result, message):
     settings = MissionSettings(waypoints=(1.0, 0.0, 2.0, 0.0, 1.0, 2.0, 2.5, 10.0))
     machine, controller, id, reference, seen, outcome = InspectionMission(settings), ControllerState.DISARMED, 0, None, [], None
-    machine.start(Goal(1.2, 10.0, mode=Mode.INSPECTION, perch_point=np.array([3.0, 0.0, 2.0])), 0.0)
+    machine.start(Goal(1.2, 10.0, perch_point=np.array([3.0, 0.0, 2.0])), 0.0)
     p, time = np.zeros(3), 0.0
     while outcome is None and time < 60.0:
         time += 0.02
@@ -100,7 +100,7 @@ def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, res
             if share >= 1.0 or (machine.phase is Phase.INSPECTING and not ends and share > 0.5):
                 controller = ControllerState.HOVERING
         target = Target(time, np.array([3.0, 0.0, 2.0]), np.array([0, 0, 0, 1.0]), 0.01, 0.01) if time > 6.0 else None
-        out = machine.tick(Inputs(time, State(p, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3)), True, controller, "held up", id, 0.0,
+        out = machine.tick(Inputs(time, State(p, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3)), True, controller, "held up", id,
                                   target, np.zeros((0, 3))))
         if any(command.name == "ARM" for command, _ in out.commands):
             controller = ControllerState.ARMED

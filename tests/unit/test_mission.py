@@ -67,7 +67,7 @@ class World:
         falling = 0.0 if self.off_at is None or self.stays else max(self.time - self.off_at - 0.1, 0.0)
         out = self.machine.tick(Inputs(
             self.time, State(self.p, self.q, np.array([0.0, 0.0, -GRAVITY * falling]), np.zeros(3)), self.ready, self.controller, "says so",
-            self.trajectory_id, 0.0, target, np.tile(self.force(), (10, 1)), plan, cancel))
+            self.trajectory_id, target, np.tile(self.force(), (10, 1)), plan, cancel))
         for command, _ in out.commands:
             self.commands.append(command)
             if command is Command.ARM and self.deaf:

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from perch_control.mission import AdhesionMonitor, Goal, MissionSettings, Mode, Plan, Refusal, State, Target
+from perch_control.mission import AdhesionMonitor, Goal, MissionSettings, Plan, Refusal, State, Target
 from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.requests import flown_order
 from perch_control.smooth_position import BEFORE
@@ -17,7 +17,7 @@ from perch_core.values import AtEnd
 from perch_core.vehicle import GRAVITY
 
 START, LENGTH = 10.0, 2.5
-GOAL = Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.array([5.0, 0.0, 4.75]), replan=True)
+GOAL = Goal(4.2, 30.0, perch_point=np.array([5.0, 0.0, 4.75]), replan=True)
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 SETTINGS = MissionSettings()
 AT_REST = State(np.zeros(3), LEVEL, np.zeros(3), np.zeros(3))
@@ -103,7 +103,7 @@ def test_a_detour_or_a_refusal_leaves_the_plan_as_it_is(length, success):
 
 @pytest.mark.parametrize("time, x, goal", [
     (START + 0.1, 5.1, GOAL), (START + LENGTH - 0.6, 5.26, GOAL),
-    (START + 0.1, 5.26, Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.zeros(3)))])
+    (START + 0.1, 5.26, Goal(4.2, 30.0, perch_point=np.zeros(3)))])
 def test_no_new_perch_for_centimetres_nor_at_the_end_nor_unasked(time, x, goal):
     assert running().query(time, AT_REST, target(10.0, x=x), goal).recovery
 
@@ -132,7 +132,7 @@ def test_the_plan_moves_with_the_wire(time):
 
 @pytest.mark.parametrize("time, x, goal", [
     (START + 0.1, 5.002, GOAL), (START + 0.1, 5.26, GOAL), (START + LENGTH - 0.1, 5.03, GOAL), (START - 0.1, 5.03, GOAL),
-    (START + 0.1, 5.03, Goal(4.2, 30.0, mode=Mode.POWERLINE, perch_point=np.zeros(3)))])
+    (START + 0.1, 5.03, Goal(4.2, 30.0, perch_point=np.zeros(3)))])
 def test_the_plan_stays_for_millimetres_for_another_wire_at_the_end_before_its_start_and_unasked(time, x, goal):
     assert running().moved(time, target(10.0, x=x), goal) is None
 

@@ -244,7 +244,7 @@ class Mission(Component[MissionParameters]):
             time=time, state=state, estimator_ready=estimator is not None and estimator.state == RUNNING,
             controller=ControllerState(status.state) if status else ControllerState.DISARMED,
             controller_message=status.message if status else "no controller/status yet",
-            trajectory_id=status.trajectory_id if status else 0, trajectory_time=status.trajectory_time if status else 0.0,
+            trajectory_id=status.trajectory_id if status else 0,
             target=running.machine.target(self._seen.pad(x), self._seen.lines, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3),
             cancel=running.goal.cancel_requested, imu_period=self._imu_period.value)
 

@@ -42,7 +42,7 @@ def goal_of(goal: PerchGoal, settings: MissionSettings) -> Goal:
         yaw = float(so3.yaw_of(so3.quat_to_matrix(np.array(goal.search_attitude))))
     return Goal(
         takeoff_height=given(goal.takeoff_height, settings.takeoff_height),
-        search_timeout=given(goal.search_timeout, settings.search_timeout), mode=goal.mode,
+        search_timeout=given(goal.search_timeout, settings.search_timeout),
         perch_point=np.array(goal.perch_point), perch_pitch=goal.perch_pitch, perception_aware=goal.perception_aware,
         search_position=position, search_yaw=yaw, inclination_hint=None if math.isnan(goal.inclination_hint) else goal.inclination_hint,
         replan=goal.replan, attempts=max(1, goal.attempts))

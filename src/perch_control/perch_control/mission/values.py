@@ -106,7 +106,6 @@ class Goal:
 
     takeoff_height: float
     search_timeout: float
-    mode: int = Mode.SURFACE
     perch_point: np.ndarray = field(default_factory=lambda: np.zeros(3))
     perch_pitch: float = 0.0
     perception_aware: bool = False
@@ -196,7 +195,6 @@ class Inputs:
     controller: ControllerState
     controller_message: str
     trajectory_id: int
-    trajectory_time: float
     target: Target | None
     specific_force_B: np.ndarray  # IMU samples since the last tick [m/s^2], shape (n, 3)
     plan: Plan | Refusal | None = None
