@@ -330,7 +330,7 @@ def test_a_plan_that_the_controller_does_not_take_ends_the_goal(replan):
     world = World(takes=False)
     world.run(Goal(takeoff_height=1.2, search_timeout=6.0, attempts=2, replan=replan))
     assert world.outcome.result is Result.REFUSED and world.outcome.message.endswith("not taken the plan: says so")
-    assert world.time < world.flown[0][0] + 0.3 and world.commands == [Command.ARM, Command.HOVER]
+    assert world.time < world.flown[0][0] + 0.6 and world.commands == [Command.ARM, Command.HOVER]
 
 
 def test_a_perch_holds_only_with_a_controller_that_is_attached():

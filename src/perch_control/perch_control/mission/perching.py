@@ -13,7 +13,7 @@ from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
 
-TAKEN = 0.2  # a controller that still hovers so long after a plan's start has not taken it [s]
+TAKEN = 0.5  # a controller that still hovers so long after a plan's start has not taken it [s]
 
 
 class InFlight(Protocol):
