@@ -470,6 +470,16 @@ def test_gains_change_in_flight_and_what_is_fixed_is_refused():
         parameters(type="pid")
 
 
+@pytest.mark.parametrize("period, count", [(0.5, (2, 4)), (0.002, (450, 510))])
+def test_the_period_of_the_reference_changes_in_flight(period, count):
+    flight = hovering()
+    config = flight.component.config
+    flight.component.reconfigure(replace(config, controller=replace(config.controller, reference_period=period)))
+    flight.references.clear()
+    flight.step(1.0)
+    assert count[0] <= len(flight.references) <= count[1]
+
+
 def test_a_parameter_leaves_alone_what_the_service_has_chosen():
     component = Controller(parameters())
     component._assembly.choose("geometric", True)

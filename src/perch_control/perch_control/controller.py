@@ -99,6 +99,8 @@ class Controller(Component[ControllerParameters]):
             if getattr(config, name) != getattr(self.config, name):
                 raise ConfigError("", name, "is fixed after the start")
         self._assembly.change(config)
+        if config.controller.reference_period != self.config.controller.reference_period:
+            self._references = self._due = 0  # counted in the old period
         self.config = config
 
     # -- sensors -----------------------------------------------------------------------------------------------------
