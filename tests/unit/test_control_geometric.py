@@ -59,7 +59,7 @@ def test_on_the_reference_the_law_is_flatness(seed):
 def test_attitude_error_turns_back_from_any_angle(angle, axis):
     axis = np.array(axis) / np.linalg.norm(axis)
     q = Rotation.from_rotvec(np.radians(angle) * axis).as_quat()
-    e, _ = attitude_error(tuple(q), (0.0, 0.0, 0.0, 1.0))
+    e = attitude_error(tuple(q), (0.0, 0.0, 0.0, 1.0))
     way = 1.0 if angle < 180 else np.sign(np.dot(e, axis))  # at 180 degrees both are as short
     np.testing.assert_allclose(e, way * 2 * np.sin(np.radians(angle) / 2) * axis, atol=1e-9)
     if angle == 10:  # the paper's e_R agrees to second order where the heading is right
@@ -73,7 +73,7 @@ def test_attitude_error_turns_back_from_any_angle(angle, axis):
 def test_a_heading_that_is_off_does_not_turn_the_tilt_error_aside(turned, tilt):
     """The moment against e_R turns b3 to the commanded one on the shortest way, whatever the heading."""
     q = (Rotation.from_rotvec((np.radians(tilt), 0, 0)) * Rotation.from_rotvec((0, 0, np.radians(turned)))).as_quat()
-    (x, y, z), _ = attitude_error(tuple(q), (0.0, 0.0, 0.0, 1.0))
+    x, y, z = attitude_error(tuple(q), (0.0, 0.0, 0.0, 1.0))
     R = Rotation.from_quat(q).as_matrix()
     shortest = np.cross(R[:, 2], (0.0, 0.0, 1.0))
     motion = R @ (-x, -y, 0.0)

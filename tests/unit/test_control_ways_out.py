@@ -39,7 +39,7 @@ def test_odometry_that_repeats_itself_ends_in_a_descent_that_brakes():
     begin, speed = loop.plant.p.copy(), loop.plant.v[0]
     repeat_last(loop)
     loop.run(1.2)
-    assert loop.controller.state is State.LANDING and loop.controller.blind
+    assert loop.controller.state is State.LANDING and loop.controller.flown.blind
     assert abs(loop.plant.v[0]) < 0.3, "the speed of the last sample is braked"
     assert loop.plant.p[0] - begin[0] < 0.6 * 1.2 * speed, "much less than it would have coasted"
     assert loop.run(5.0, until=lambda x: x.controller.state is State.DISARMED), loop.events

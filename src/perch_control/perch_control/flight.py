@@ -93,11 +93,6 @@ class FlightController:
         return self._thrust.ratio(self.compensator)
 
     @property
-    def blind(self) -> bool:
-        """A descent without position is under way."""
-        return self.flown.blind is not None
-
-    @property
     def law_name(self) -> str:
         """Name of the control law that flies, `+l1` with the augmentation."""
         return self.law.name + ("+l1" if self.compensator is not None else "")

@@ -87,7 +87,7 @@ class GeometricController(Law):
         cone = self._narrow + share * (self._wide - self._narrow)
         out = control_step(state, reference, rotors.speed, rotors.command, compensation, self._gains, self._limits(cone),
                            self.gains.lead, self._vehicle)
-        return ControlOutput(*out[:6])
+        return ControlOutput(*out)
 
     def _limits(self, cone: float) -> tuple[float, ...]:
         return (FEEDBACK_MAX, cone, THRUST_FLOOR, self._rate_max, ACCELERATION_MAX)

@@ -53,20 +53,20 @@ def force_about(a_ref, feedback, axis, tilt_tangent, floor):
 
 @compiled
 def attitude_error(q, q_C):
-    """Attitude error e_R in B [rad], and the rotation q_e = q_C^-1 q. [M:eq2]
+    """Attitude error e_R in B [rad]. [M:eq2]
 
-    `2 sin(angle / 2) axis` of two rotations: the shortest one between both b3, and what is left about b3. To first order
-    that is the paper's `vee(R_C^T R - R^T R_C) / 2`, but it keeps growing up to 180 degrees, so an inverted vehicle is
-    turned back; and a heading that is far off does not turn the tilt error aside: with one common axis a vehicle that
+    `2 sin(angle / 2) axis` of the two rotations that q_C^-1 q is made of: the shortest one between both b3, and what is left
+    about b3. To first order that is the paper's `vee(R_C^T R - R^T R_C) / 2`, but it keeps growing up to 180 degrees, so an
+    inverted vehicle is turned back; and a heading that is far off does not turn the tilt error aside: with one common axis a vehicle that
     spins is tilted in a spiral.
     """
     e = quaternion_product((-q_C[0], -q_C[1], -q_C[2], q_C[3]), q)
     upright = sqrt(e[2] * e[2] + e[3] * e[3])
     if upright < 1e-6:  # b3 opposite to the commanded one: any axis across it is a shortest one
-        return (2.0 * e[0], 2.0 * e[1], 0.0), e
+        return (2.0 * e[0], 2.0 * e[1], 0.0)
     k = 2.0 / upright
     turn = k * e[2] if e[3] >= 0.0 else -k * e[2]
-    return (k * (e[3] * e[0] + e[1] * e[2]), k * (e[3] * e[1] - e[0] * e[2]), turn), e
+    return (k * (e[3] * e[0] + e[1] * e[2]), k * (e[3] * e[1] - e[0] * e[2]), turn)
 
 
 @compiled
@@ -140,7 +140,7 @@ def geometric_step(state, reference, extra, gains, limits, J):
     w_C, dw_C = limited(w_C, limits[3]), limited(dw_C, limits[4])
 
     q_C = quaternion_of(b1, b2, b3)
-    e_R, _ = attitude_error(q, q_C)
+    e_R = attitude_error(q, q_C)
     w_C_W = axpy(w_C[0], b1, axpy(w_C[1], b2, scale(w_C[2], b3)))
     dw_C_W = axpy(dw_C[0], b1, axpy(dw_C[1], b2, scale(dw_C[2], b3)))
     w_C_B = (dot(B1, w_C_W), dot(B2, w_C_W), dot(B3, w_C_W))

@@ -105,7 +105,7 @@ def control_step(state, reference, speed, command, extra, gains, limits, lead, v
 
     Returns:
         Commanded rotor speeds (4) [rad/s], wanted wrench (4) [N, N m], rotor thrusts that will be reached (4) [N],
-        q_C (4), w_C and dw_C in B (3, 3), predicted state (13).
+        q_C (4), w_C and dw_C in B (3, 3).
     """
     mass, J = vehicle[0][0], vehicle[0][1:4]
     coefficient, _, _, tau = vehicle[1]
@@ -118,4 +118,4 @@ def control_step(state, reference, speed, command, extra, gains, limits, lead, v
     thrust, M, q_C, w_C, dw_C = geometric_step(ahead, reference, extra, gains, limits, J)
     wrench = (mass * thrust, M[0], M[1], M[2])
     out, f = rotors_for(wrench, speed, vehicle, lead)
-    return out, wrench, f, q_C, w_C, dw_C, ahead
+    return out, wrench, f, q_C, w_C, dw_C

@@ -135,7 +135,6 @@ class NmpcController(Law):
         self.period, self._spacing = period, max(1, round(self._dt / period))
         self._rows = self._new_rows()
         self._weights()
-        self.fallback.pace(period)
 
     def _new_rows(self) -> ReferenceRows:
         period = self.period if self.period == NOMINAL_PERIOD else self._dt / self._spacing
