@@ -17,6 +17,7 @@ from perch_control.weak_landing import WeakLanding
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.control_flights.faults import END_STATES, FAULTS, fly_fault
+from unit.controller_flight import hovering
 
 NOISE = 0.316  # of the accelerometer per sample [m/s^2]
 
@@ -92,6 +93,15 @@ def test_what_a_wire_does_is_not_taken_for_weak_rotors(kept_ready):
     loop.plant.disturbances = Disturbances(rotor_factor=(0.6,) * 4)
     loop.run(0.3)
     assert flight.health.weak
+
+
+def test_what_was_felt_before_the_imu_fell_silent_says_nothing_of_the_rotors():
+    flight = hovering()
+    flight.step(0.1)
+    flight.follow(flight.path(flight.plant.p, (0.0, 0.0, 2.6), 1.2))
+    flight.step(1.0, imu=False)
+    flight.step(0.5)
+    assert not flight.component.flight.health.weak and flight.plant.p[2] > 2.0
 
 
 @pytest.mark.parametrize("share", [0.53, 0.6, 0.7])

@@ -283,7 +283,8 @@ class FlightController:
             if x.flying:
                 if not x.airborne and not x.at_ground:
                     x = x._replace(airborne=True)
-                x = self.supervisor.act(self._thrust.judged(x, self.law, self.compensator))
+                felt = x.now - self._senses.imu_stamp <= self.settings.odometry_timeout
+                x = self.supervisor.act(self._thrust.judged(x, self.law, self.compensator, felt))
         return self._answered(x)
 
     def step_blind(self, stamp: float) -> StepResult:

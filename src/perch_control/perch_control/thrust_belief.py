@@ -32,9 +32,9 @@ class ThrustBelief:
         self.health.reset()
         return self._believed(x, law, compensator)
 
-    def judged(self, x: FlightState, law: Law, compensator: L1Augmentation | None) -> FlightState:
-        """Compare felt and promised thrust in free air; weak rotors are a weaker vehicle from now on."""
-        if x.at_ground or x.may_touch(_TOUCHING) or hypot(*x.belief[10:13]) > RATE_MOST:
+    def judged(self, x: FlightState, law: Law, compensator: L1Augmentation | None, fresh: bool) -> FlightState:
+        """Compare felt and promised thrust in free air, `fresh`: `felt` is of the present; weak rotors are a weaker vehicle from now on."""
+        if not fresh or x.at_ground or x.may_touch(_TOUCHING) or hypot(*x.belief[10:13]) > RATE_MOST:
             self.health.pause(x.now)
         elif self.health.update(self.felt, self._promised(x), x.now):
             if not x.weak:
