@@ -34,7 +34,8 @@ class FlightState(NamedTuple):
         attached_to: normal of the surface that carries the vehicle, None: none does.
         blind: the descent without position that is under way.
         ground: height at which the vehicle was armed [m]; `airborne`: it has been clear of it since.
-        lands: it was ordered to land: a hover becomes a landing.
+        lands: it was ordered to land, or was landing: a hover becomes a landing.
+        stops: what was flown has been left before its end: no perch goes on from the brake.
         events: what has happened since the last step.
         now: time of the step [s].
         belief: state that is flown on, 13 floats: odometry, or its prediction while odometry is refused.

@@ -4,7 +4,7 @@
 | --- | --- | --- | --- |
 | `tracked` | TRACKING, or RECOVERING by a planned way out | the trajectory | its start has come; it is left as planned |
 | `stopped` | HOVERING; RECOVERING where tilted, turning or at a surface | a brake | its end, abort, HOVER, geofence, no VIO |
-| `stayed` | as `stopped` | a hover where the vehicle believes to be | odometry has jumped and stays |
+| `stayed` | as `stopped`; RECOVERING stays | a hover where the vehicle believes to be | odometry has jumped and stays |
 | `recovered` | RECOVERING | guidance by the state | off the plan, contact missed, departure |
 | `settled` | HOVERING | a brake from the state | a recovery has come to rest |
 | `brought_down` | as `landing`; as `recovered` where `stopped` is | | LAND |
@@ -82,7 +82,12 @@ def stopped(x: FlightState, message: str) -> FlightState:
 
 
 def stayed(x: FlightState, message: str) -> FlightState:
-    """Hover where the vehicle now believes to be: what was followed no longer fits."""
+    """Hover where the vehicle now believes to be: what was followed no longer fits. A landing and a recovery go on from there."""
+    x = x._replace(lands=x.lands or x.mode is State.LANDING)
+    if isinstance(x.source, Recovery):
+        return entered(x, State.RECOVERING, f"recovering: {message}")._replace(source=x.source.moved(x.belief[0:3]))
+    if x.surface_normal:
+        return recovered(x, message)
     return stopped(following(x, Hold.at(x.belief[0:3], axes_of(x.belief[6:10])[1])), message)
 
 
