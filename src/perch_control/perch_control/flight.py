@@ -173,6 +173,8 @@ class FlightController:
             x = self.flown = self._thrust.reset(x, self.law, self.compensator)
         elif x.mode not in (State.ARMED, State.TRACKING, State.HOVERING):
             raise TrajectoryRefused(f"the vehicle is {x.mode.name.lower()}, not armed and ready")
+        if x.braking and order.at_end is not AtEnd.HOLD:
+            raise TrajectoryRefused("what was flown is being braked to a hover")
         if x.mode is State.HOVERING and order.at_end is not AtEnd.HOLD and x.spare < _MARGIN_PERCH:
             raise TrajectoryRefused(f"the thrust margin in hover is {x.spare:.2f}; a perch needs {_MARGIN_PERCH:g}")
         check_joints(order.source.trajectory)

@@ -59,6 +59,7 @@ class FlightState(NamedTuple):
     ground: float
     airborne: bool
     lands: bool
+    stops: bool
     events: tuple[str, ...]
     # the last seven change in each step
     now: float
@@ -72,7 +73,7 @@ class FlightState(NamedTuple):
     @classmethod
     def disarmed(cls, vehicle: Vehicle) -> FlightState:
         """A vehicle of which nothing is known but its file."""
-        return cls(vehicle, False, State.DISARMED, "disarmed", Hold(Setpoint((0.0, 0.0, 0.0))), 0.0, None, 0, None, None, None, -inf, False, False, (),
+        return cls(vehicle, False, State.DISARMED, "disarmed", Hold(Setpoint((0.0, 0.0, 0.0))), 0.0, None, 0, None, None, None, -inf, False, False, False, (),
                    0.0, (), (0.0, ()), stopped(vehicle), 1.0, 1.0, 0.0)
 
     def sensed(self, now: float, belief: tuple[float, ...], seen: tuple[float, tuple[float, ...]],
@@ -98,6 +99,11 @@ class FlightState(NamedTuple):
     def low(self) -> bool:
         """The ground on which it was armed is too near for a hover; what is further below is not on it."""
         return abs(self.belief[2] - self.ground) < _LOW
+
+    @property
+    def braking(self) -> bool:
+        """To a hover, out of what was left before its end."""
+        return self.stops and self.elapsed < self.source.duration
 
     @property
     def elapsed(self) -> float:

@@ -41,7 +41,7 @@ _ZERO = (0.0, 0.0, 0.0)
 def entered(x: FlightState, mode: State, message: str) -> FlightState:
     """Another mode, and why. A trajectory is kept while it is tracked, the place that it meets on the recovery from there, too."""
     return x._replace(mode=mode, message=message, events=(*x.events, message), order=x.order if mode is State.TRACKING else None,
-                      lands=x.lands and mode in (State.TRACKING, State.RECOVERING, State.HOVERING),
+                      lands=x.lands and mode in (State.TRACKING, State.RECOVERING, State.HOVERING), stops=False,
                       meeting=x.meeting if mode in (State.TRACKING, State.RECOVERING) else None)
 
 
@@ -78,7 +78,8 @@ def stopped(x: FlightState, message: str) -> FlightState:
     if turning or x.surface_normal or reference_tilt_deg(x.belief, setpoint) > TILT_MARGIN:
         return recovered(x, message)
     p, v, a = _point_of_departure(x, setpoint)
-    return following(entered(x, State.HOVERING, message), brake(p, v, a, setpoint.h, within=x.stopping[0]))
+    early = x.stops or (x.order is not None and x.elapsed < x.order.source.duration)
+    return following(entered(x, State.HOVERING, message)._replace(stops=early), brake(p, v, a, setpoint.h, within=x.stopping[0]))
 
 
 def stayed(x: FlightState, message: str) -> FlightState:
