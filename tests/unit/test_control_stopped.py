@@ -12,11 +12,13 @@ from closed_loop.plant import Disturbances
 from perch_control.admission import AtEnd, Order, TrajectoryRefused
 from perch_control.flight_settings import FlightSettings
 from perch_control.modes import Command, State
+from perch_control.recovery import Recovery
 from perch_control.reference import SampledReference
+from perch_core.trajectory import rest_to_rest
 from perch_core.values import Ask
 from perch_planner.problem import PerchSettings
 from unit.controller_flight import Flight, hovering, parameters
-from unit.test_control_supervisor import along_x, leaving, ready
+from unit.test_control_supervisor import along_x, hovering as hovering_loop, leaving, moved, ready
 
 NOWHERE = {"p_WB": (float("nan"),) * 3}
 
@@ -124,14 +126,100 @@ def test_a_hover_at_the_ground_is_a_landing():
     assert flight.state is State.DISARMED
 
 
+def continuation(loop, start: float) -> Order:
+    """The rest of the plan of `leaving`."""
+    now = loop.controller.flown.now
+    return Order(8, SampledReference(along_x(now, 0.4 * (now - start), 0.4, 2.5), loop.controller.vehicle.mass), now, AtEnd.RECOVER, 0.25, 1.6)
+
+
+def test_an_abort_is_not_undone_by_a_plan_that_goes_on_from_its_brake():
+    loop, start = leaving()
+    loop.controller.abort("stop it")
+    loop.run(0.02)
+    with pytest.raises(TrajectoryRefused, match="being braked to a hover"):
+        loop.controller.follow(continuation(loop, start))
+    loop.run(1.0)
+    assert loop.controller.state is State.HOVERING
+    p = loop.plant.p.copy()
+    loop.follow(rest_to_rest(p, p + [0.1, 0.0, 0.0], 0.0, 0.0, 1.0), AtEnd.CONTACT, id=9)
+
+
+def test_a_perch_may_begin_in_the_brake_at_the_end_of_a_move():
+    loop = hovering_loop()
+    p = loop.plant.p.copy()
+    loop.follow(rest_to_rest(p, p + [0.5, 0.0, 0.0], 0.0, 0.0, 1.0))
+    loop.run(1.1)
+    assert loop.controller.state is State.HOVERING and loop.controller.flown.elapsed < loop.controller.flown.source.duration
+    loop.follow(rest_to_rest(p + [0.5, 0.0, 0.0], p + [1.0, 0.0, 0.0], 0.0, 0.0, 1.0), AtEnd.CONTACT, id=2)
+
+
+@pytest.mark.parametrize("before, kept", [(0.2, False), (0.2, True), (-0.1, False)])
+def test_an_abort_that_leaves_by_the_plans_own_recovery_is_a_recovery_and_is_not_undone(before, kept):
+    own = 0.5 if before > 0.0 else 0.05
+    loop, start = leaving(recovery_start=own)
+    loop.run(start + own - before - loop.controller.flown.now)
+    loop.controller.abort("stop it")
+    with pytest.raises(TrajectoryRefused, match="about to be left"):
+        loop.controller.follow(continuation(loop, start))
+    if kept:
+        ready(loop, start, start + own + 0.05)
+    loop.references.clear()
+    loop.run(max(before, 0.0) + 0.02)
+    assert loop.controller.state is State.RECOVERING and loop.controller.flown.message == "recovering as planned: stop it"
+    loop.run(0.2)
+    assert loop.controller.state is State.RECOVERING and (loop.controller.flown.order.start > start) is kept
+    assert np.abs(np.diff(np.array(loop.references)[:, 0])).max() < 0.5 * 0.002 + 0.1 * kept, "the reference does not jump"
+    loop.run(2.5)
+    assert loop.controller.state is State.HOVERING
+    loop.follow(rest_to_rest(loop.plant.p, loop.plant.p + [0.1, 0.0, 0.0], 0.0, 0.0, 1.0), AtEnd.CONTACT, id=9)
+
+
+def shifted(loop, by) -> None:
+    """From now on, odometry is off by as much."""
+    loop.odometry = lambda plant: moved(plant.state, p=plant.p + by)
+
+
+def test_a_landing_goes_on_where_odometry_has_jumped():
+    loop = hovering_loop()
+    loop.controller.command(Command.LAND)
+    loop.run(0.5)
+    assert loop.controller.state is State.LANDING
+    shifted(loop, (1.0, 0.0, 0.0))
+    assert loop.run(10.0, until=lambda x: x.controller.state is State.DISARMED) and loop.plant.impact_speed < 1.0, loop.events
+
+
+@pytest.mark.parametrize("before", [0.1, -0.3])
+def test_a_recovery_beside_a_surface_knows_it_where_odometry_has_jumped(before):
+    plan, loop = perch("surface_90_1.7m"), make_loop(floor=-10.0)
+    loop.begin_in_hover()
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    loop.run(0.04 + plan.trajectory.duration - before)
+    shifted(loop, (0.0, 0.4, 0.0))
+    distances = []
+    loop.run(0.1, until=lambda x: distances.append((x.plant.p - plan.contact) @ plan.normal))
+    source = loop.controller.flown.source
+    assert isinstance(source, Recovery) and source.normal is not None, loop.events
+    loop.run(3.0, until=lambda x: distances.append((x.plant.p - plan.contact) @ plan.normal))
+    assert loop.controller.state is State.HOVERING and (before < 0.0 or min(distances) > 0.0), loop.events
+
+
+@pytest.mark.parametrize("command, state", [(Command.ARM, State.ARMED), (Command.ATTACHED, State.ATTACHED)])
+def test_what_waits_through_a_silence_at_rest_is_not_begun_in_its_middle(command, state):
+    flight = Flight()
+    flight.step(0.2)
+    flight.order(command)
+    waiting(flight, (0.0, 0.0, 0.6)).step(1.2, odometry=False)
+    flight.step(0.3)
+    assert flight.state is state and flight.plant.p[2] < 0.01
+
+
 def test_an_abort_that_waits_for_its_way_out_is_not_undone_by_the_next_plan():
     loop, start = leaving()
     ready(loop, start, start + 0.6)
     loop.run(0.3)
     loop.controller.abort("stop it")
-    now, mass = loop.controller.flown.now, loop.controller.vehicle.mass
     with pytest.raises(TrajectoryRefused, match="about to be left"):
-        loop.controller.follow(Order(7, SampledReference(along_x(now, 0.4 * (now - start), 0.4, 2.5), mass), now, AtEnd.RECOVER, 0.25, 1.6))
+        loop.controller.follow(continuation(loop, start))
     loop.run(0.4)
     assert loop.controller.state is State.RECOVERING
 

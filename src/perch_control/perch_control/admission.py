@@ -14,7 +14,7 @@ from perch_core.values import AtEnd, TrajectoryOrder, limits
 from perch_core.vehicle import Vehicle
 
 _EARLIEST = 60.0        # a trajectory is not kept for longer before its start [s]
-_LATEST = 0.5           # the oldest start that is flown: a plan is of the present [s]
+LATEST = 0.5            # the oldest start that is flown: a plan is of the present [s]
 START_GAP = 0.35        # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
 _START_SPEED_GAP = 1.0  # the same for the velocity [m/s]
 _STEP = 0.02            # largest step inside a trajectory [m]; ten times this for the velocity [m/s]
@@ -129,8 +129,8 @@ def check_start(order: Order, now: float, present: Setpoint) -> None:
         TrajectoryRefused: with the gap and its limit.
     """
     late = now - order.start
-    if late > _LATEST:
-        raise TrajectoryRefused(f"starts {late:.2f} s in the past; at most {_LATEST:g} s is allowed")
+    if late > LATEST:
+        raise TrajectoryRefused(f"starts {late:.2f} s in the past; at most {LATEST:g} s is allowed")
     if -late > _EARLIEST:
         raise TrajectoryRefused(f"starts {-late:.2f} s in the future; at most {_EARLIEST:g} s is allowed")
     begin = order.source.setpoint(max(late, 0.0))

@@ -167,7 +167,7 @@ class FlightController:
         x = self.flown
         if self.odometry_age > self.settings.odometry_timeout:
             raise TrajectoryRefused("no usable odometry")
-        if self._schedule.leaving or x.lands:
+        if self._schedule.leaving(x) or x.lands:
             raise TrajectoryRefused("what is flown is about to be left")
         if x.mode is State.ATTACHED:
             x = self.flown = self._thrust.reset(x, self.law, self.compensator)
@@ -291,6 +291,7 @@ class FlightController:
 
     def step_blind(self, stamp: float) -> StepResult:
         """Answer a step for which no odometry has come, from the IMU alone; without that nobody knows where up is for long."""
+        self._schedule.drop()
         x = self._senses.silence(self.flown, stamp)
         if x.flying and stamp - self._senses.imu_stamp > DOWN_TIME:
             x = motors_off(x, State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s")

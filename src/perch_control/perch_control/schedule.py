@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import dist, inf
 
-from perch_control.admission import START_GAP, AtEnd, Order, check_joints
+from perch_control.admission import LATEST, START_GAP, AtEnd, Order, check_joints
 from perch_control.flight_state import FlightState
 from perch_control.guidance import blended
 from perch_control.maneuvers import tracked
@@ -20,6 +20,7 @@ class Schedule:
 
     def __init__(self) -> None:
         self._pending: tuple[Order, str] | None = None  # a trajectory, and why it is a way out
+        self._last: tuple[Order, str] | None = None  # the running trajectory, and why it is left by the recovery appended to it
         self._ways_out: list[Order] = []  # recoveries out of the running trajectory, in the order of their starts
 
     @property
@@ -27,10 +28,9 @@ class Schedule:
         """Whether a trajectory is to follow."""
         return self._pending is not None
 
-    @property
-    def leaving(self) -> bool:
+    def leaving(self, x: FlightState) -> bool:
         """Whether a way out is to follow."""
-        return self._pending is not None and bool(self._pending[1])
+        return self._pending is not None and bool(self._pending[1]) or bool(self._left_for(x))
 
     def put(self, order: Order) -> None:
         """The next trajectory."""
@@ -38,7 +38,7 @@ class Schedule:
 
     def drop(self) -> None:
         """Nothing is to follow."""
-        self._pending = None
+        self._pending = self._last = None
 
     def keep_ready(self, x: FlightState, order: Order) -> None:
         """Keep a recovery that leaves the trajectory with the same id, for an abort before it starts. [P:V-B]
@@ -61,22 +61,26 @@ class Schedule:
             return None
         own = order.start + order.recovery_start if order.recovery_start >= 0.0 else inf
         if x.now >= own:
-            self._pending = None
+            self._pending, self._last = None, (order, reason)
             return x._replace(message=f"{reason}; the recovery is under way")
         ways = [o for o in self._ways_out if o.id == order.id and o.start >= x.now]
         start = min([o.start for o in ways] + [own])  # a plan may end in a recovery of its own
         if start - x.now > _LEAVE_TIME:
             return None
         self._pending = next(((o, reason) for o in ways if o.start == start), None)
+        self._last = (order, reason) if self._pending is None else None
         return x._replace(message=f"{reason}; planned recovery in {start - x.now:.2f} s")
 
     def activated(self, x: FlightState) -> FlightState:
         """Start the pending trajectory when its time has come, or the recovery that was planned for this vehicle at the wire."""
         if self._pending is None:
-            return self._left_the_wire(x)
+            return self._left_as_planned(x)
         order, leaving = self._pending
         source = order.source
         resting = x.mode in (State.ARMED, State.ATTACHED)
+        if resting and x.now - order.start > LATEST:
+            self._pending = None
+            return x._replace(message=f"trajectory {order.id} is not begun: it starts {x.now - order.start:.2f} s in the past")
         if not (resting or x.mode in (State.TRACKING, State.HOVERING)):
             self._pending = None
         elif x.now >= order.start:
@@ -87,15 +91,22 @@ class Schedule:
             return tracked(x, order, source if resting else blended(x.expected(x.now), source, begin, end), leaving)
         return x
 
-    def _left_the_wire(self, x: FlightState) -> FlightState:
+    def _left_for(self, x: FlightState) -> str:
+        """Why the running trajectory is left by its appended recovery; empty: it is not."""
+        return self._last[1] if self._last is not None and self._last[0] is x.order else ""
+
+    def _left_as_planned(self, x: FlightState) -> FlightState:
         """Where the appended recovery is due, take the one that is kept ready for then: it begins where the vehicle is by now.
 
-        Nothing is blended: the reference comes to the vehicle, and the way from there is clear of the wire.
+        Nothing is blended: the reference comes to the vehicle, and the way from there is clear of the wire. Without one the trajectory
+        goes on; where it is being left, that is a recovery.
         """
         order = x.order
-        if order is None or order.at_end is not AtEnd.RECOVER or order.recovery_start < 0.0:
+        if order is None or order.recovery_start < 0.0:
             return x
-        own = order.start + order.recovery_start
+        own, leaving = order.start + order.recovery_start, self._left_for(x)
         way = next((o for o in self._ways_out if o.id == order.id and own - _EARLY <= o.start <= x.now
-                    and dist(o.source.setpoint(x.now - o.start).p, x.belief[0:3]) < START_GAP), None)
-        return x if way is None else tracked(x, way, way.source)
+                    and dist(o.source.setpoint(x.now - o.start).p, x.belief[0:3]) < START_GAP), None) if order.at_end is AtEnd.RECOVER else None
+        if way is not None:
+            return tracked(x, way, way.source, leaving)
+        return tracked(x, order, x.source, leaving) if leaving and x.now >= own and x.mode is State.TRACKING else x
