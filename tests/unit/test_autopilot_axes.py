@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import socket
 import sys
+from itertools import count
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -75,11 +76,13 @@ def node():
     theirs.close()
 
 
+STAMPS = count(NANOSECONDS, NANOSECONDS // 50)  # as often as odometry goes out
+
+
 @given(p=VECTORS, R=ROTATIONS, v=VECTORS, w=VECTORS, P=SPREADS, Q=SPREADS)
 @settings(max_examples=50, deadline=None)
 def test_odometry_goes_out_as_frd_in_ned(node, p, R, v, w, P, Q):
-    node._sent = None  # as much later as it goes out
-    node.on_odometry(OdometryState(NANOSECONDS, tuple(p), tuple(R.as_quat()), tuple(v), tuple(w), P, Q))
+    node.on_odometry(OdometryState(next(STAMPS), tuple(p), tuple(R.as_quat()), tuple(v), tuple(w), P, Q))
     _, frame, child, *place, q, vx, vy, vz, rx, ry, rz, pose, twist = node._mavlink.sent["odometry"]
     assert (frame, child) == (1, 12)                                                   # MAV_FRAME_LOCAL_NED, MAV_FRAME_BODY_FRD
     assert place == pytest.approx(NED.apply(p)) and same((*q[1:], q[0]), NED * R * FRD.inv())  # wxyz
