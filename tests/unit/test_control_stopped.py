@@ -126,9 +126,9 @@ def test_a_hover_at_the_ground_is_a_landing():
     assert flight.state is State.DISARMED
 
 
-def continuation(loop, start: float) -> Order:
-    """The rest of the plan of `leaving`."""
-    now = loop.controller.flown.now
+def continuation(loop, start: float, ahead: float = 0.0) -> Order:
+    """The rest of the plan of `leaving`, from `ahead` seconds later on."""
+    now = loop.controller.flown.now + ahead
     return Order(8, SampledReference(along_x(now, 0.4 * (now - start), 0.4, 2.5), loop.controller.vehicle.mass), now, AtEnd.RECOVER, 0.25, 1.6)
 
 
@@ -142,6 +142,15 @@ def test_an_abort_is_not_undone_by_a_plan_that_goes_on_from_its_brake():
     assert loop.controller.state is State.HOVERING
     p = loop.plant.p.copy()
     loop.follow(rest_to_rest(p, p + [0.1, 0.0, 0.0], 0.0, 0.0, 1.0), AtEnd.CONTACT, id=9)
+
+
+def test_a_stop_at_the_geofence_is_not_undone_by_a_plan_that_waits():
+    loop, start = leaving()
+    flight, (x, _, _) = loop.controller, loop.plant.p
+    flight.follow(continuation(loop, start, ahead=0.05))
+    flight.use(flight.law, flight.gains, FlightSettings(fence_high=(x - 0.01, 20.0, 20.0)))
+    loop.run(0.5)
+    assert [e[2] for e in loop.events[1:]] == ["tracking trajectory 7", "hover: 0.0 m outside the geofence"], loop.events
 
 
 def test_a_perch_may_begin_in_the_brake_at_the_end_of_a_move():
@@ -197,10 +206,10 @@ def test_a_recovery_beside_a_surface_knows_it_where_odometry_has_jumped(before):
     shifted(loop, (0.0, 0.4, 0.0))
     distances = []
     loop.run(0.1, until=lambda x: distances.append((x.plant.p - plan.contact) @ plan.normal))
-    source = loop.controller.flown.source
-    assert isinstance(source, Recovery) and source.normal is not None, loop.events
+    assert isinstance(loop.controller.flown.source, Recovery), loop.events
     loop.run(3.0, until=lambda x: distances.append((x.plant.p - plan.contact) @ plan.normal))
     assert loop.controller.state is State.HOVERING and (before < 0.0 or min(distances) > 0.0), loop.events
+    assert distances[-1] > 0.25, "away from the wall"
 
 
 @pytest.mark.parametrize("command, state", [(Command.ARM, State.ARMED), (Command.ATTACHED, State.ATTACHED)])

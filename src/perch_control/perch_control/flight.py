@@ -147,7 +147,7 @@ class FlightController:
             raise CommandRefused(f"arm is refused: {x.mode.name.lower()}; disarm first")
         if self.odometry_age > self.settings.odometry_timeout:
             raise CommandRefused("arm is refused: no usable odometry" + (f" ({why})" if (why := self._senses.refused) else ""))
-        if x.now - self._senses.imu_stamp > self.settings.odometry_timeout:
+        if self._senses.imu_age(x.now) > self.settings.odometry_timeout:
             raise CommandRefused("arm is refused: no usable IMU samples")
         if x.mode is State.DISARMED and axes_of(x.belief[6:10])[2][2] < _ARM_TILT:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
@@ -173,7 +173,7 @@ class FlightController:
             x = self.flown = self._thrust.reset(x, self.law, self.compensator)
         elif x.mode not in (State.ARMED, State.TRACKING, State.HOVERING):
             raise TrajectoryRefused(f"the vehicle is {x.mode.name.lower()}, not armed and ready")
-        if x.braking and order.at_end is not AtEnd.HOLD:
+        if not x.takes(order):
             raise TrajectoryRefused("what was flown is being braked to a hover")
         if x.mode is State.HOVERING and order.at_end is not AtEnd.HOLD and x.spare < _MARGIN_PERCH:
             raise TrajectoryRefused(f"the thrust margin in hover is {x.spare:.2f}; a perch needs {_MARGIN_PERCH:g}")
@@ -285,7 +285,7 @@ class FlightController:
             if x.flying:
                 if not x.airborne and not x.at_ground:
                     x = x._replace(airborne=True)
-                felt = x.now - self._senses.imu_stamp <= self.settings.odometry_timeout
+                felt = self._senses.imu_age(x.now) <= self.settings.odometry_timeout
                 x = self.supervisor.act(self._thrust.judged(x, self.law, self.compensator, felt))
         return self._answered(x)
 
@@ -293,7 +293,7 @@ class FlightController:
         """Answer a step for which no odometry has come, from the IMU alone; without that nobody knows where up is for long."""
         self._schedule.drop()
         x = self._senses.silence(self.flown, stamp)
-        if x.flying and stamp - self._senses.imu_stamp > DOWN_TIME:
+        if x.flying and self._senses.imu_age(stamp) > DOWN_TIME:
             x = motors_off(x, State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s")
         return self._answered(self._descending(x, "no odometry"))
 

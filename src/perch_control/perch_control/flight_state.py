@@ -105,6 +105,10 @@ class FlightState(NamedTuple):
         """To a hover, out of what was left before its end."""
         return self.stops and self.elapsed < self.source.duration
 
+    def takes(self, order: Order) -> bool:
+        """Whether a trajectory may begin: what was left before its end is braked to a hover, not flown on."""
+        return not self.braking or order.at_end is AtEnd.HOLD
+
     @property
     def elapsed(self) -> float:
         """Time since the running reference began [s]."""

@@ -46,7 +46,6 @@ class Recovery(ByState):
     """Guidance from the present state; `update` first in each period, then `setpoint`.
 
     Attributes:
-        normal: outward normal of the surface at its beginning, None: in the open.
         finished: the vehicle is upright and slow, and away from the surface.
     """
 
@@ -58,7 +57,7 @@ class Recovery(ByState):
             normal: outward normal of the surface at `state`, None: in the open.
         """
         self._thrust_max = specific_thrust_max
-        self._origin, self.normal = state[0:3], normal
+        self._origin, self._normal = state[0:3], normal
         self._push = None if normal is None or normal[2] >= cos(radians(30.0)) else normal
         _, self._h, _ = axes_of(state[6:10])
         self._setpoint = Setpoint(state[0:3], state[3:6], h=self._h)
@@ -69,7 +68,7 @@ class Recovery(ByState):
         p, v, w = state[0:3], state[3:6], state[10:13]
         b1, b2, b3 = axes_of(state[6:10])
         moved = axpy(-1.0, self._origin, p)
-        clearance = dot(moved, self.normal) if self.normal is not None else _AWAY_DISTANCE
+        clearance = dot(moved, self._normal) if self._normal is not None else _AWAY_DISTANCE
         if elapsed > _PUSH_TIME or clearance > _PUSH_CLEARANCE:
             self._push = None
         if self._push is not None:
@@ -78,8 +77,8 @@ class Recovery(ByState):
             return
         climb = min(max(-_CLIMB_GAIN * moved[2], -_CLIMB_SPEED), _CLIMB_SPEED)
         away: Vector = (0.0, 0.0, 0.0)
-        if self.normal is not None and clearance < _AWAY_DISTANCE:
-            nx, ny, _ = self.normal
+        if self._normal is not None and clearance < _AWAY_DISTANCE:
+            nx, ny, _ = self._normal
             away = scale(_AWAY_SPEED, (nx, ny, 0.0))
         demand = axpy(-_VELOCITY_GAIN, v, scale(_VELOCITY_GAIN, (away[0], away[1], climb)))
         side = limited((demand[0], demand[1], 0.0), _SIDE_MAX)

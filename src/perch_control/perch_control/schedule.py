@@ -81,7 +81,7 @@ class Schedule:
         if resting and x.now - order.start > LATEST:
             self._pending = None
             return x._replace(message=f"trajectory {order.id} is not begun: it starts {x.now - order.start:.2f} s in the past")
-        if not (resting or x.mode in (State.TRACKING, State.HOVERING)):
+        if not (resting or x.mode in (State.TRACKING, State.HOVERING)) or not (leaving or x.takes(order)):
             self._pending = None
         elif x.now >= order.start:
             self._pending = None
@@ -105,8 +105,9 @@ class Schedule:
         if order is None or order.recovery_start < 0.0:
             return x
         own, leaving = order.start + order.recovery_start, self._left_for(x)
-        way = next((o for o in self._ways_out if o.id == order.id and own - _EARLY <= o.start <= x.now
-                    and dist(o.source.setpoint(x.now - o.start).p, x.belief[0:3]) < START_GAP), None) if order.at_end is AtEnd.RECOVER else None
-        if way is not None:
-            return tracked(x, way, way.source, leaving)
+        if order.at_end is AtEnd.RECOVER:
+            for way in self._ways_out:
+                here = way.id == order.id and own - _EARLY <= way.start <= x.now
+                if here and dist(way.source.setpoint(x.now - way.start).p, x.belief[0:3]) < START_GAP:
+                    return tracked(x, way, way.source, leaving)
         return tracked(x, order, x.source, leaving) if leaving and x.now >= own and x.mode is State.TRACKING else x

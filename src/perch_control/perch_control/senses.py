@@ -25,19 +25,22 @@ class Senses:
     Attributes:
         age: of the last odometry sample that was accepted [s].
         refused: why the last sample was refused; empty: it was accepted.
-        imu_stamp: of the last IMU sample [s].
         unseen: IMU samples since the odometry that was accepted last: time [s], rates [rad/s], specific force [m/s^2].
     """
 
     def __init__(self) -> None:
-        self.age, self.refused, self.imu_stamp = inf, "", -inf
+        self.age, self.refused, self._imu_stamp = inf, "", -inf
         self._quiet = -inf  # no refusal is an event until then [s]
         self.unseen: deque[tuple[float, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=500)
         self._gate, self._smooth = OdometryGate(), SmoothPosition()
 
+    def imu_age(self, now: float) -> float:
+        """Of the last IMU sample at a time [s], in s; infinite before the first."""
+        return now - self._imu_stamp
+
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...], keep: bool) -> None:
         """Take an IMU sample: time [s], in B [rad/s, m/s^2]; `keep` it for the beginning of a descent without position."""
-        self.imu_stamp = stamp
+        self._imu_stamp = stamp
         if keep:
             self.unseen.append((stamp, gyro, accel))
 
@@ -46,7 +49,7 @@ class Senses:
         """The state by a sample, or predicted where it is refused, and the verdict on it; arguments as of `FlightController.step`."""
         verdict = Verdict(False, reason=f"odometry: {problem}") if problem else self._gate.check(stamp, sample, covariances)
         # Odometry that repeats itself does not stop the time.
-        x = self._believed(x, stamp if stamp > x.now else max(x.now, self.imu_stamp), verdict, sample)
+        x = self._believed(x, stamp if stamp > x.now else max(x.now, self._imu_stamp), verdict, sample)
         self.age = x.now - self._gate.stamp if self._gate.stamp is not None else inf
         return x, verdict
 

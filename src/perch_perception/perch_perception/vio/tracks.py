@@ -18,11 +18,6 @@ class Track:
     shape: list[np.ndarray] = field(default_factory=list)
     noise: list[float] = field(default_factory=list)
 
-    def bearings(self, places: list[int]) -> Bearings:
-        """The bearings at given places of the lists."""
-        return Bearings(np.array([self.b_C[k] for k in places]), np.array([self.shape[k] for k in places]),
-                        np.array([self.noise[k] for k in places]))
-
 
 @dataclass
 class Tracks:
