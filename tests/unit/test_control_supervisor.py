@@ -319,6 +319,15 @@ def ready(loop, start: float, planned: float, id: int = 7) -> None:
     loop.controller.keep_ready(Order(id, SampledReference(order, loop.controller.vehicle.mass), planned, AtEnd.HOLD, 0.0, 0.0))
 
 
+def test_an_abort_does_not_leave_by_a_recovery_that_begins_elsewhere():
+    loop, start = leaving()
+    elsewhere = along_x(start + 0.3, 1.5, 0.4, 0.8, brakes=True)
+    loop.controller.keep_ready(Order(7, SampledReference(elsewhere, loop.controller.vehicle.mass), start + 0.3, AtEnd.HOLD, 0.0, 0.0))
+    loop.controller.abort("stop it")
+    loop.run(0.5)
+    assert loop.controller.state is State.HOVERING and loop.plant.p[0] < 0.5, loop.events
+
+
 def test_an_abort_leaves_by_the_next_planned_recovery():
     loop, start = leaving()
     for planned in (0.3, 0.6, 0.9):

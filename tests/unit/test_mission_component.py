@@ -202,6 +202,14 @@ def test_a_planner_that_is_missing_or_refuses_ends_the_goal(answer, said):
     assert (world.goal.ending, world.goal.result.error_code) == ("aborted", Result.REFUSED) and said in world.goal.result.message
 
 
+@pytest.mark.parametrize("answer", [Unavailable("plan_way_out failed"), PerchPlan(success=False, message="none")])
+def test_ways_out_are_asked_for_although_the_planner_has_none_once(answer):
+    world, asked = World(), []
+    world.mission.plan_way_out = lambda request, due: (asked.append(seconds(request.start)), world.mission.on_plan_way_out(answer))
+    world.send().run()
+    assert world.goal.ending == "succeeded" and len(asked) > 5 and asked == sorted(set(asked))
+
+
 def test_a_planner_that_never_answers_ends_the_goal():
     world = World(planner=lambda request: None).send().run()
     assert (world.goal.ending, world.goal.result.error_code) == ("aborted", Result.TIMEOUT) and "planner" in world.goal.result.message

@@ -75,6 +75,7 @@ def test_a_plan_comes_as_polynomials_with_certificates(ask: Asked) -> None:
         thrust=limits["thrust"], body_rate=limits["body_rate"][1], speed=limits["speed"][1], height=limits["height"],
         extension=0.15)
     assert verify(plan.trajectory.durations, plan.trajectory.coefficients, need, step=1e-3) == []
+    assert "clearance" in str(verify(plan.trajectory.durations, plan.trajectory.coefficients, replace(need, clearance=0.1), step=1e-3))
 
 
 def test_options_of_a_request_replace_the_parameters(ask: Asked) -> None:

@@ -81,10 +81,12 @@ def test_an_abort_at_any_time_finds_a_recovery(planner: PowerlinePlanner, planne
     assert so3.quat_to_matrix(plan.recovery.states[-1, Q])[2, 2] > np.cos(np.radians(0.1))
 
 
-def test_a_recovery_begins_even_where_the_flight_has_eaten_the_margin(planner: PowerlinePlanner, planned: PlannedProblem) -> None:
-    state = planned.plan.perch.states[-1].copy()
-    state[P] -= 0.028 * REQUEST.perch.s3_W  # 2 mm of air are left
-    plan = planner.plan(replace(REQUEST, start=state, perch=None, recovery_only=True))
+@pytest.mark.parametrize("radius, air", [(0.03, 0.002), (0.03, -0.005), (0.015, -0.005)])
+def test_a_recovery_begins_even_where_the_flight_has_eaten_the_margin(planner: PowerlinePlanner, planned: PlannedProblem, radius: float,
+                                                                      air: float) -> None:
+    state, lines = planned.plan.perch.states[-1].copy(), tuple(replace(line, radius=radius) for line in REQUEST.lines)
+    state[P] -= (0.06 - radius - air) * REQUEST.perch.s3_W
+    plan = planner.plan(replace(REQUEST, lines=lines, start=state, perch=None, recovery_only=True))
     assert all(bound.holds for bound in plan.bounds)
 
 

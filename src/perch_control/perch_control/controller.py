@@ -122,7 +122,7 @@ class Controller(Component[ControllerParameters]):
             self._answer_silence(stamp, "odometry has stopped: the IMU is answered")
 
     def on_odometry(self, state: OdometryState) -> None:
-        """Answer with a motor command, whatever the sample is worth."""
+        """Answer a sample of the present in `map` with a motor command, whatever its values are worth."""
         if state.frame != "map":
             self.warn(f"odometry: frame {state.frame!r} is not 'map': ignored", every=1.0)
             return

@@ -233,7 +233,7 @@ class Mission(Component[MissionParameters]):
         inputs = self._inputs(running, time, odometry)
         if plan is not None and stamp >= plan.due and plan.answer is not None:
             running.pending, inputs = None, replace(inputs, plan=plan_answer(plan.answer))
-        if way_out is not None and stamp >= way_out.due and way_out.answer is not None and not isinstance(way_out.answer, Unavailable):
+        if way_out is not None and stamp >= way_out.due and way_out.answer is not None:
             running.way_out, inputs = None, replace(inputs, way_out=plan_answer(way_out.answer))
         self._act(running, stamp, running.machine.tick(inputs))
 

@@ -63,7 +63,8 @@ class Schedule:
         if x.now >= own:
             self._pending, self._last = None, (order, reason)
             return x._replace(message=f"{reason}; the recovery is under way")
-        ways = [o for o in self._ways_out if o.id == order.id and o.start >= x.now]
+        ways = [o for o in self._ways_out if o.id == order.id and o.start >= x.now
+                and dist(o.source.setpoint(0.0).p, x.expected(o.start).p) < START_GAP]
         start = min([o.start for o in ways] + [own])  # a plan may end in a recovery of its own
         if start - x.now > _LEAVE_TIME:
             return None

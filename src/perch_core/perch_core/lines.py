@@ -6,7 +6,7 @@ components, see `components`. Planner, controller and evaluation use the same on
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from perch_core.components import (
 from perch_core.errors import PerchError
 
 _E3 = np.array([0.0, 0.0, 1.0])
+_THINNEST = 1e-3        # radius that is left of a wire [m]
 _LEVEL_LEAST = 0.1      # sine of a line's angle from the vertical, below which a tilt about it means nothing
 ACTIVATION_RAMP = 0.02  # length over which the end of a segment fades in [m]
 _STEEPNESS = float(np.arctanh(0.98))  # tanh reaches 1 % and 99 % at the ends of the ramp
@@ -56,6 +57,10 @@ class Segment:
         """The segment between two end points in W [m]."""
         start, end = np.asarray(start, float), np.asarray(end, float)
         return cls((start + end) / 2, end - start, float(np.linalg.norm(end - start)) / 2, radius, id)
+
+    def thinner(self, by: float) -> Segment:
+        """The same with a smaller radius [m]; some of it is left."""
+        return replace(self, radius=max(self.radius - by, min(self.radius, _THINNEST))) if by > 0.0 else self
 
     @property
     def ends(self) -> tuple[Array, Array]:

@@ -75,7 +75,7 @@ def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
         contact_delay=settings.contact_delay,
         tube=(settings.tube_time, TUBE_STEP, TUBE_SHARE, TUBE_FLOOR), thrust=limits.thrust,
         body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension,
-        rotors=each)
+        clearance=limits.clearance, rotors=each)
 
 
 def draw(path: Path, plan: PerchPlan, problem: PerchProblem, limits: Limits, vehicle: Vehicle) -> None:

@@ -62,6 +62,7 @@ class Requirements:
         speed: greatest [m/s].
         height: least and greatest [m].
         extension: radius of the rim [m].
+        clearance: least distance of the rim from the surface [m].
         rotors: limits of the single rotors, or None.
     """
 
@@ -85,6 +86,7 @@ class Requirements:
     speed: float
     height: tuple[float, float]
     extension: float
+    clearance: float = 0.0
     rotors: Rotors | None = None
 
 
@@ -281,7 +283,7 @@ def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float,
     sine = (_length(np.cross(f, need.s3)) / _length(f))[:, 0]
     gap = distance - need.extension * sine
     worst = int(gap.argmin())
-    at_most("clearance", 0.0, float(gap[worst]), float(times[worst]), 1e-9)
+    at_most("clearance", need.clearance, float(gap[worst]), float(times[worst]), 1e-9)
 
 
 def _turn_rates(before: Axes, after: Axes, step: float) -> Array:

@@ -28,7 +28,7 @@ def _certificate(quantity: str, unit: str, times: np.ndarray, values: np.ndarray
 
 
 def certify(vehicle: Vehicle, times: np.ndarray, states: np.ndarray, rates: np.ndarray, lines: Sequence[Segment],
-            height_min: float, thrust_max: float, radius_reduction: float = 0.0) -> tuple[Certificate, ...]:
+            height_min: float, thrust_max: float) -> tuple[Certificate, ...]:
     """Certificates of everything that must hold on the way.
 
     Args:
@@ -36,18 +36,16 @@ def certify(vehicle: Vehicle, times: np.ndarray, states: np.ndarray, rates: np.n
         times: [s], shape (m,).
         states: shape (m, 17).
         rates: thrust rates [N/s], shape (m, 4).
-        lines: every known segment.
+        lines: every known segment, as thick as it counts.
         height_min: [m].
         thrust_max: greatest rotor thrust that the plan may use [N].
-        radius_reduction: taken off the wires' radius [m]; the paper's recovery does so.
 
     Returns:
         clearance (scaled distance minus 1, all lines), height, thrust, thrust_rate, body_rate.
     """
     nearest = np.full(len(times), np.inf)
     for line in lines:
-        slim = Segment(line.centre, line.direction, line.half_length, line.radius - radius_reduction, line.id)
-        nearest = np.minimum(nearest, scaled_clearance(states[:, P], states[:, Q], slim, vehicle.body_radii))
+        nearest = np.minimum(nearest, scaled_clearance(states[:, P], states[:, Q], line, vehicle.body_radii))
     found = [_certificate("clearance", "-", times, nearest, 0.0)] if len(lines) else []
     return (*found,
             _certificate("height", "m", times, states[:, 2], height_min),

@@ -91,7 +91,8 @@ class Search:
 
     def bounds(self, task: Task, times: np.ndarray, states: np.ndarray, rates: np.ndarray) -> tuple[Certificate, ...]:
         """Certificates of a flight: all limits and its end."""
-        return (*certify(self.vehicle, times, states, rates, task.request.lines, self.settings.height_min, self._thrust_max(task), task.radius_reduction),
+        lines = [line.thinner(task.radius_reduction) for line in task.request.lines]
+        return (*certify(self.vehicle, times, states, rates, lines, self.settings.height_min, self._thrust_max(task)),
                 *certify_end(times, states, task.wanted, *task.accuracy))
 
     def _thrust_max(self, task: Task) -> float:
@@ -142,7 +143,7 @@ class Search:
         margins, clearance = self.settings.margins, np.inf
         height = min(margins.height, max(0.0, 0.5 * (start[2] - self.settings.height_min)))
         for reduction in (0.0, RADIUS_REDUCTION):
-            thin = [replace(line, radius=max(line.radius - reduction, 1e-3)) for line in lines]
+            thin = [line.thinner(reduction) for line in lines]
             clearance = self._clearance(start, thin)
             if clearance > 0:
                 return replace(margins, height=height, clearance=min(margins.clearance, 0.5 * _share(clearance))), reduction
@@ -175,7 +176,7 @@ class Search:
             states, inputs = previous if previous is not None else task.guess(attempt, intervals)
             numbers = Numbers(
                 start=task.request.start, reference=np.concatenate([task.wanted.p_WB, task.wanted.s3_W, task.wanted.v_W, np.zeros(3)]),
-                lines=np.array([line_parameters(line, task.radius_reduction) for line in lines]).reshape(-1, 8),
+                lines=np.array([line_parameters(line.thinner(task.radius_reduction)) for line in lines]).reshape(-1, 8),
                 run_weights=run_weights(task.weights, self.formulation.ramp, vehicle.thrust_rate_max, intervals),
                 end_weights=end_weights(task.weights), see_weights=see_weights(s.perception, intervals), duration=task.duration,
                 height_min=s.height_min + margins.height, thrust=(vehicle.thrust_min + margins.thrust, thrust_max - margins.thrust),

@@ -246,6 +246,6 @@ def _nonzeros(matrix: ca.SX) -> ca.SX:
     return stacked
 
 
-def line_parameters(segment: lines.Segment, radius_reduction: float = 0.0) -> np.ndarray:
+def line_parameters(segment: lines.Segment) -> np.ndarray:
     """A segment as the stage functions take it, shape (8,)."""
-    return np.array([*segment.centre, *segment.direction, segment.radius - radius_reduction, segment.half_length])
+    return np.array([*segment.centre, *segment.direction, segment.radius, segment.half_length])
