@@ -10,7 +10,7 @@ from ros_graph.commands import Commands, carry_out
 
 EXAMPLES = """examples:
   python3 scripts/action.py list -t
-  python3 scripts/action.py send_goal /perch perch_msgs/action/Perch '{takeoff_height: 1.2}' --feedback
+  python3 scripts/action.py send_goal /perch perch_msgs/action/Perch '{takeoff_height: 1.2, search_timeout: .nan, inclination_hint: .nan}' --feedback
 """
 
 

@@ -15,9 +15,10 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
-from perch_autopilot import firmware, msp
+from perch_autopilot import command, firmware, msp
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.namespace import NamespaceError
 from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
@@ -311,3 +312,14 @@ def test_a_firmware_that_will_arm_when_the_pilot_has_moved_his_stick_is_waited_f
         assert bench.most == 0.0
     finally:
         bench.close()
+
+
+@pytest.mark.parametrize("line, code", [("set p_roll = 180", 0), ("set p_roll = 1", 2)])
+def test_a_command_ends_the_command_line_in_which_an_autopilot_does_not_fly(line, code, monkeypatch, tmp_path):
+    sent, file = [], tmp_path / "mine.txt"
+    file.write_text(line + "\n")
+    monkeypatch.setattr(command, "Link", lambda address: SimpleNamespace(write=sent.append, read=lambda timeout: b"set p_roll = 180\r\n# "))
+    assert command.main(["check", "/dev/null", str(file)]) == code and sent[-1] == b"exit\r\n"
+    assert command.main(["configure", "/dev/null", str(file)]) == 0 and sent[-1] == b"save\r\n"
+    monkeypatch.setattr(command, "Link", lambda address: SimpleNamespace(write=sent.append, read=lambda timeout: b"###ERROR\r\n# "))
+    assert command.main(["configure", "/dev/null", str(file)]) == 2 and sent[-1] == b"exit\r\n"

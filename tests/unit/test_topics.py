@@ -8,7 +8,9 @@ import pytest
 from perch_core.component import Action, Client, Component, Input, Output, Service, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
+from perch_core.ros.goal_server import ServedGoal
 from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust
+from perch_msgs.action import Perch
 from perch_sim.scenario import NODES
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -94,3 +96,10 @@ def test_every_port_of_every_node_has_its_row(name):
 def test_no_channel_has_two_rows(rows):
     channels = [row.channel for row in rows]
     assert len(set(channels)) == len(channels)
+
+
+def test_a_goal_that_is_rejected_has_not_perched():
+    ends, results = [], []
+    handle = SimpleNamespace(request=Perch.Goal(), abort=lambda: ends.append("aborted"))
+    ServedGoal(SimpleNamespace(finish=lambda handle, result: results.append(result)), handle, topics.action("perch")).reject("busy")
+    assert ends == ["aborted"] and (results[0].success, results[0].error_code, results[0].message) == (False, Perch.Result.BAD_GOAL, "busy")

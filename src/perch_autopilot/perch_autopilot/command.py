@@ -31,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point; 0 done, 2 it cannot be done."""
+    """Entry point; 0 done, 2 it cannot be done, 130 interrupted."""
     args = parser().parse_args(arguments)
     try:
         if args.verb == "build":
@@ -40,13 +40,18 @@ def main(arguments: list[str] | None = None) -> int:
         configuration = load_configuration(args.configuration)
         link = Link(args.link)
         cli = Cli(link.write, link.read)
-        if args.verb == "configure":
-            cli.apply(configuration)
-            print(f"sent {len(configuration.lines)} lines; the autopilot restarts with them")
-        else:
-            cli.check(configuration)
-            print(f"all {len(configuration.lines)} lines are set")
+        try:
+            if args.verb == "configure":
+                cli.apply(configuration)
+                print(f"sent {len(configuration.lines)} lines; the autopilot restarts with them")
+            else:
+                cli.check(configuration)
+                print(f"all {len(configuration.lines)} lines are set; the autopilot restarts")
+        finally:
+            cli.leave()
         return 0
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130

@@ -75,7 +75,7 @@ class Cli:
         Raises:
             CliError: it does not answer.
         """
-        self._send, self._receive = send, receive
+        self._send, self._receive, self._saved = send, receive, False
         self.ask("#", end="")
 
     def ask(self, line: str, end: str = "\r\n") -> str:
@@ -105,6 +105,12 @@ class Cli:
                 words = " ".join(answer.replace(line, "").strip(" #\r\n").split())
                 raise CliError(f"{configuration.source}: {line}: the firmware refuses it: {words[:200]}")
         self._send(b"save\r\n")
+        self._saved = True
+
+    def leave(self) -> None:
+        """End the command line, in which the firmware neither answers nor arms: it restarts. What is not saved is forgotten."""
+        if not self._saved:
+            self._send(b"exit\r\n")
 
     def check(self, configuration: Configuration) -> None:
         """Read everything back.
@@ -115,7 +121,8 @@ class Cli:
         found = dump_lines(self.ask("dump"))
         wrong = differences(configuration.lines, found)
         if wrong:
-            raise CliError(f"{configuration.source}: the autopilot is set otherwise: " + "; ".join(wrong[:5]))
+            more = f"; and {len(wrong) - 5} more" if len(wrong) > 5 else ""
+            raise CliError(f"{configuration.source}: the autopilot is set otherwise: " + "; ".join(wrong[:5]) + more)
 
 
 def dump_lines(answer: str) -> list[str]:

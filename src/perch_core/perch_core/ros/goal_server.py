@@ -65,13 +65,6 @@ class ServedGoal:
 
     def finish(self, ending: str, result: Any) -> None:
         """End it: "succeeded", "cancelled" (only where that was asked for) or "aborted"."""
-        self._end(ending, self._row.result_message(result))
-
-    def reject(self, why: str) -> None:
-        """End it before it has begun."""
-        self._end("aborted", self._row.type.Result(message=why))
-
-    def _end(self, ending: str, result: Any) -> None:
         self.finished = True
         if ending == "succeeded":
             self._handle.succeed()
@@ -79,4 +72,8 @@ class ServedGoal:
             self._handle.canceled()
         else:
             self._handle.abort()
-        self._server.finish(self._handle, result)
+        self._server.finish(self._handle, self._row.result_message(result))
+
+    def reject(self, why: str) -> None:
+        """End it before it has begun."""
+        self.finish("aborted", self._row.rejected(why))

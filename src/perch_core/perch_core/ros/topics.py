@@ -153,16 +153,17 @@ SERVICES = (
 
 @dataclass(frozen=True)
 class ActionRow:
-    """An action: its type, goal to value, feedback and result to messages."""
+    """An action: its type, goal to value, feedback and result to messages, and the result of a goal that is rejected, from the reason."""
 
     channel: str
     type: Any
     goal_value: Convert
     feedback_message: Convert
     result_message: Convert
+    rejected: Convert
 
 
-ACTIONS = (ActionRow("perch", Perch, mission.goal_value, mission.feedback_message, mission.result_message),)
+ACTIONS = (ActionRow("perch", Perch, mission.goal_value, mission.feedback_message, mission.result_message, mission.rejected),)
 
 
 def _rows() -> tuple[Topic, ...]:

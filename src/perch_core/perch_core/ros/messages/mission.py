@@ -33,6 +33,11 @@ def feedback_message(feedback: PerchFeedback) -> Perch.Feedback:
                           message=feedback.message)
 
 
+def rejected(why: str) -> PerchResult:
+    """Of a goal that is not taken."""
+    return PerchResult(False, Perch.Result.BAD_GOAL, why)
+
+
 def result_message(result: PerchResult) -> Perch.Result:
     """How it ended."""
     return Perch.Result(
