@@ -13,8 +13,10 @@ from perch_core.ros import qos, topics
 from perch_core.ros.component_node import ComponentNode
 from perch_core.values import Serialized
 from rclpy.clock import Clock, ClockType
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
+MATCH = 1.0  # publishers of topics that are kept are looked at this often [s]
 TAKE = 0.02  # lazy inputs are taken this often where nothing else asks for them [s]
 SHARED = ("/tf", "/tf_static")  # topics with many writers, inside this process and outside
 
@@ -29,6 +31,7 @@ class Intake:
     def __init__(self, node: ComponentNode) -> None:
         self._node, self._wiring = node, node.wiring
         self._lazy: list[tuple[Subscription, Callable[[bytes], None]]] = []
+        self._kept: list[tuple[Subscription, Input[Any], topics.Topic, Callable[[bytes], None]]] = []
         self.private: set[str] = set()
 
     def add(self, port: Input[Any]) -> None:
@@ -45,19 +48,36 @@ class Intake:
             self.private.add(resolved)
             self._wiring.add_reader(resolved, self._local(port, row, channel, resolved, handler))
             return
-        profile = row.qos.subscribe
-        receive: Callable[[bytes], None]
-        if port.value is Serialized:
-            receive, profile = partial(self._receive_raw, row, resolved, handler), qos.kept(row.qos)
-        else:
-            receive = _Reader(node, channel, row, handler)
-        if port.lazy:
-            if not self._lazy:
-                node.create_timer(TAKE, lambda: self._wiring.enter(self.take_lazy), clock=Clock(clock_type=ClockType.STEADY_TIME))
-            subscription = node.create_unwatched(row.message, channel, profile)
-            self._lazy.append((subscription, receive))
-        else:
-            node.create_subscription(row.message, channel, partial(self.enter, receive), profile, raw=True)
+        if port.value is not Serialized:
+            self._subscribe(port, row, _Reader(node, channel, row, handler), row.qos.subscribe)
+            return
+        receive = partial(self._receive_raw, row, resolved, handler)
+        subscription = self._subscribe(port, row, receive, qos.kept(row.qos))
+        if row.qos.subscribe.reliability is ReliabilityPolicy.BEST_EFFORT:
+            if not self._kept:
+                node.create_timer(MATCH, lambda: self._wiring.enter(self._match_publishers), clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self._kept.append((subscription, port, row, receive))
+
+    def _subscribe(self, port: Input[Any], row: topics.Topic, receive: Callable[[bytes], None], profile: QoSProfile) -> Subscription:
+        node, channel = self._node, port.channel(self._node.component)
+        if not port.lazy:
+            return node.create_subscription(row.message, channel, partial(self.enter, receive), profile, raw=True)
+        if not self._lazy:
+            node.create_timer(TAKE, lambda: self._wiring.enter(self.take_lazy), clock=Clock(clock_type=ClockType.STEADY_TIME))
+        subscription = node.create_unwatched(row.message, channel, profile)
+        self._lazy.append((subscription, receive))
+        return subscription
+
+    def _match_publishers(self) -> None:
+        """Take a topic that is kept as best effort where somebody publishes it so: a reliable subscription gets nothing of that."""
+        for kept in tuple(self._kept):
+            subscription, port, row, receive = kept
+            publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
+            if any(one.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT for one in publishers):
+                self._kept.remove(kept)
+                self._subscribe(port, row, receive, qos.kept(row.qos, ReliabilityPolicy.BEST_EFFORT))
+                self._lazy = [one for one in self._lazy if one[0] is not subscription]
+                self._node.destroy_subscription(subscription)
 
     def take_lazy(self) -> None:
         """Take what waits in the middleware."""

@@ -36,6 +36,6 @@ STATIC = Qos(_profile(50, latched=True), _profile(50, latched=True))        # /t
 CLOCK = Qos(_profile(10), _profile(10, reliable=False))
 
 
-def kept(purpose: Qos) -> QoSProfile:
+def kept(purpose: Qos, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
     """For who keeps every message of a topic: reliable, and with room for seconds of it."""
-    return QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=purpose.publish.durability)
+    return QoSProfile(depth=2000, reliability=reliability, durability=purpose.publish.durability)
