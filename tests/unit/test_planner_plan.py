@@ -219,12 +219,20 @@ def test_a_waypoint_too_near_to_the_surface_is_told_where_it_is_and_what_it_lack
     assert words in str(caught.value) and caught.value.margin == pytest.approx(margin)
 
 
+@pytest.mark.parametrize("waypoint", [(1.57, 0.17, 1.46), (1.58, -0.59, 1.68), (1.53, 0.76, 0.94), (1.55, -0.21, 1.47)])
+def test_a_clearance_that_the_first_plan_lacks_is_kept(waypoint):
+    problem = PerchProblem(HOVER, surface(90.0), (Waypoint(waypoint),))
+    least = [next(c for c in checked(problem, PerchSettings(clearance_min=asked)).certificates if c.quantity == "clearance").minimum for asked in (0.0, 0.03)]
+    assert least[0] < 0.03 <= least[1]
+
+
 @pytest.mark.parametrize("distance", [0.05, 0.1])
 def test_a_refusal_for_a_waypoint_whose_rim_touches_a_wall_names_the_clearance_that_it_takes(distance):
     problem = PerchProblem(HOVER, surface(90.0), (Waypoint((1.7 - distance, 0.0, 1.5)),))
     with pytest.raises(PerchRefusal, match="clearance") as caught:
         plan(problem, PerchSettings(), VEHICLE)
     assert -0.3 < caught.value.relaxed["clearance_min"] < 0.0
+    assert -np.inf < next(c for c in caught.value.certificates if c.quantity == "clearance").minimum < 0.0
     assert all(c.holds for c in plan(problem, PerchSettings(**caught.value.relaxed), VEHICLE).certificates)
 
 
@@ -299,6 +307,7 @@ def test_a_refusal_whose_programs_are_used_up_names_limits_without_which_there_i
     with pytest.raises(PerchRefusal) as caught:
         plan(problem, PerchSettings(), VEHICLE)
     assert caught.value.relaxed and "even without" not in str(caught.value)
+    assert all(abs(value) < 100.0 for value in caught.value.relaxed.values()), "what the plan takes, not the value that takes a limit away"
     plan(problem, PerchSettings(**caught.value.relaxed), VEHICLE)
 
 

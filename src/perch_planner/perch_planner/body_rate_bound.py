@@ -106,6 +106,15 @@ def spin_rate(f_x: float, f_y: float, f_z: float, x_x: float, x_y: float, yaw: f
 
 
 @compiled
+def squared_rate(f_x: float, f_y: float, f_z: float, j_x: float, j_y: float, j_z: float, yaw: float, yaw_rate: float) -> float:
+    """|omega|^2 for components of f and of the jerk [rad^2/s^2]. [M:eq13]"""
+    f2 = max(f_x * f_x + f_y * f_y + f_z * f_z, 1e-12)
+    x_x, x_y, x_z = f_y * j_z - f_z * j_y, f_z * j_x - f_x * j_z, f_x * j_y - f_y * j_x
+    spin = spin_rate(f_x, f_y, f_z, x_x, x_y, yaw, yaw_rate)
+    return (x_x * x_x + x_y * x_y + x_z * x_z) / (f2 * f2) + spin * spin
+
+
+@compiled
 def _squared_rate(parts: Array) -> float:
     """|omega|^2 where the parts begin."""
     spin = spin_rate(parts[3, 0], parts[4, 0], parts[5, 0], parts[6, 0], parts[7, 0], parts[9, 0], parts[10, 0])

@@ -127,5 +127,5 @@ def judge(coefficients: Array, yaw: Array, heading: Array, durations: Array, que
     thrust = thrust_cuts(coefficients, durations, extrema, low if cut else -np.inf, high if cut else np.inf, side)
     if not cut:
         where[:] = -1.0
-    other = limit_cuts(where, coefficients, yaw, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension)
+    other = limit_cuts(where, coefficients, yaw, durations, p_S + clearance * s3, v_S, s3, low_height, high_height, speed, rate, extension)
     return extrema, results, (least, most, checked, kept, holds, stretch), thrust, other, thrusts

@@ -79,7 +79,8 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         self._plan(planner.plan, request, reply)
 
     def on_plan_way_out(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
-        """Plan from the start to a hover in front of the surface; waypoints, times and the impact's options do not matter."""
+        """Plan from the start to a hover in front of the surface; waypoints, times and the impact's options must be those of a perch, and are
+        not used."""
         self._plan(plan_way_out, request, reply)
 
     def _plan(self, method: Method, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:

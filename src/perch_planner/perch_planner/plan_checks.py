@@ -10,7 +10,7 @@ from perch_core import bernstein
 from perch_core.arrays import Array
 from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
-from perch_planner.body_rate_bound import prove_rate, rate_coarse_bound, spin_rate
+from perch_planner.body_rate_bound import prove_rate, rate_coarse_bound, squared_rate
 from perch_planner.bounds import magnitude, maximum, smallest, squared, time_derivative
 from perch_planner.clearance_bound import prove_clearance, surface_distance
 
@@ -111,15 +111,13 @@ def _sample(distance: Array, force: Array, jerk: Array, yaw: Array, yaw_rate: Ar
     dist, heading, turn = _values(distance, _AT14), _values(yaw, _AT14), _values(yaw_rate, _AT13)
     count = len(_PLACES)
     for k in range(count):
-        f_x, f_y, f_z, j_x, j_y, j_z = f[0, k], f[1, k], f[2, k], j[0, k], j[1, k], j[2, k]
+        f_x, f_y, f_z = f[0, k], f[1, k], f[2, k]
         f2 = max(f_x * f_x + f_y * f_y + f_z * f_z, 1e-12)
         along = f_x * s3[0] + f_y * s3[1] + f_z * s3[2]
         here = dist[0, k] - extension * sqrt(max(1.0 - along * along / f2, 0.0))
         if here < gap:
             gap, gap_at = here, k / (count - 1)
-        x_x, x_y, x_z = f_y * j_z - f_z * j_y, f_z * j_x - f_x * j_z, f_x * j_y - f_y * j_x
-        spin = spin_rate(f_x, f_y, f_z, x_x, x_y, heading[0, k], turn[0, k])
-        here = (x_x * x_x + x_y * x_y + x_z * x_z) / (f2 * f2) + spin * spin
+        here = squared_rate(f_x, f_y, f_z, j[0, k], j[1, k], j[2, k], heading[0, k], turn[0, k])
         if here > rate:
             rate, rate_at_ = here, k / (count - 1)
     return gap, gap_at, sqrt(rate), rate_at_
@@ -237,7 +235,9 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
     out[CLEARANCE, MINIMUM], i, place = prove_clearance(distances, forces, squares, s3, extension, clearance, gap_wanted)
     if i >= 0:
         _doubt(where, CLEARANCE, i, place)
-    out[BODY_RATE, MAXIMUM] = np.inf
+        if gap_wanted < clearance:
+            out[CLEARANCE, MINIMUM] = gap_wanted
+    out[BODY_RATE, MAXIMUM] = np.inf if rate_wanted < rate else rate_wanted
     if rate_wanted < rate:  # else a sample is too fast
         out[BODY_RATE, MAXIMUM], i, place, found, found_at = prove_rate(forces, squares, jerks, yaw, durations, coarse, rate,
                                                                         rate_wanted)

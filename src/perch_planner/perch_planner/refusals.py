@@ -11,8 +11,10 @@ from perch_core.jit import compiled
 from perch_core.values import Certificate
 from perch_core.vector3 import norm
 from perch_core.vehicle import GRAVITY, Vehicle
+from perch_planner.body_rate_bound import squared_rate
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 
+_ROUNDING = 1e-6  # of a start that is a state of a plan at its limit
 BAD_INPUT = "bad_input"
 UNREACHABLE_TILT = "unreachable_tilt"
 INFEASIBLE_WINDOW = "infeasible_window"
@@ -38,25 +40,25 @@ class PerchRefusal(PlanningRefusal):
 
 
 @compiled
-def _figures(points: Array, a: Array, R_WS: Array, extension: float, offset: float, moving: bool, low_height: float,
-             high_height: float, clearance: float) -> tuple[float, float, float, int, float, int, float, float]:
+def _figures(points: Array, a: Array, j: Array, yaw: float, yaw_rate: float, R_WS: Array, extension: float, offset: float, moving: bool,
+             low_height: float, high_height: float, clearance: float) -> tuple[float, float, float, float, int, float, int, float, float]:
     """What is known of a plan from its start and its points.
 
     Args:
         points: start, waypoints and the surface's centre in W [m], shape (k, 3).
-        a: acceleration of the start [m/s^2].
+        a, j, yaw, yaw_rate: of the start [m/s^2, m/s^3, rad, rad/s].
         R_WS: axes of the surface, the last its outward normal.
         extension, offset: radius of the vehicle's disc, and distance of its centre from the surface at contact [m].
         moving: the contact's place is not known.
         low_height, high_height, clearance: limits [m].
 
     Returns:
-        (specific thrust of the start [m/s^2], reach of the rim towards the surface at the start [m], distance of the start
+        (specific thrust of the start [m/s^2], its body rate [rad/s], reach of the rim towards the surface at the start [m], distance of the start
         from the surface's plane [m], first point whose height is out of range and that height [m], first waypoint that is too
         near to the plane and its distance [m], least length of the way to the contact [m]); points are -1 where there is none.
     """
     x, y, z = a[0], a[1], a[2] + GRAVITY
-    specific = sqrt(x * x + y * y + z * z)
+    specific, rate = sqrt(x * x + y * y + z * z), sqrt(squared_rate(x, y, z, j[0], j[1], j[2], yaw, yaw_rate))
     lean = min(abs(x * R_WS[0, 2] + y * R_WS[1, 2] + z * R_WS[2, 2]) / max(specific, 1e-9), 1.0)
     last, wrong, near = len(points) - 1, -1, -1
     start = height = distance = 0.0
@@ -74,7 +76,7 @@ def _figures(points: Array, a: Array, R_WS: Array, extension: float, offset: flo
             start = far
         elif k < last and near < 0 and far <= clearance:
             near, distance = k, far
-    return specific, extension * sqrt(1.0 - lean * lean), start, wrong, height, near, distance, way
+    return specific, rate, extension * sqrt(1.0 - lean * lean), start, wrong, height, near, distance, way
 
 
 def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle) -> None:
@@ -82,7 +84,7 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
 
     Raises:
         PerchRefusal: the surface's attitude needs a thrust out of range [M:eq9, M:eq11], the vehicle cannot hover, the
-            start or the contact break the box, the start breaks the thrust range, or the contact is too far away.
+            start or the contact break the box, the start breaks the thrust range or turns too fast, or the contact is too far away.
     """
     low, high = limits.thrust
     contact = vehicle.mass * settings.impact_acceleration
@@ -100,14 +102,17 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         raise PerchRefusal(THRUST_FLOOR, "hover thrust m g below tau_max [M:eq16]", high - 1.02 * hover,
                            f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N")
     start, surface = problem.start, problem.surface
-    specific, rim, distance, wrong, height, near, at_waypoint, way = _figures(
-        problem.points, start.a, surface.R_WS, limits.extension, vehicle.perch_offset, bool(problem.target_velocity[2]),
+    specific, rate, rim, distance, wrong, height, near, at_waypoint, way = _figures(
+        problem.points, start.a, start.j, start.yaw, start.yaw_rate, surface.R_WS, limits.extension, vehicle.perch_offset, bool(problem.target_velocity[2]),
         *limits.height, limits.clearance)
     specific *= vehicle.mass
     if not low <= specific <= high:
         raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
                            min(specific - low, high - specific),
                            f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N")
+    if rate > (1.0 + _ROUNDING) * limits.body_rate:
+        raise PerchRefusal(BODY_RATE, "body rate of the start state [M:eq13]", limits.body_rate - rate,
+                           f"the start state already turns with {rate:.1f} rad/s, more than body_rate_max {limits.body_rate:g} rad/s")
     if wrong >= 0:
         margin = min(height - limits.height[0], limits.height[1] - height)
         name = ("start", *(f"waypoint {i}" for i in range(len(problem.waypoints))), "contact")[wrong]

@@ -47,8 +47,8 @@ class _Limit(NamedTuple):
 
 
 _LIMITS = {
-    "height_min": _Limit(-1e3, refusals.BOX, "height limits", "m"),
-    "height_max": _Limit(1e3, refusals.BOX, "height limits", "m"),
+    "height_min": _Limit(-1e4, refusals.BOX, "height limits", "m"),
+    "height_max": _Limit(1e4, refusals.BOX, "height limits", "m"),
     "duration_max": _Limit(600.0, refusals.BOX, "duration_max", "s"),
     "speed_max": _Limit(1e3, refusals.BOX, "speed limit", "m/s"),
     "rotor_margin": _Limit(-1e3, refusals.THRUST_FLOOR, "thrust range of the single rotors"),
@@ -152,30 +152,39 @@ class _Trials:
             if not (used := self._without(taken)):
                 return None
         for name in reversed(_LIMITS):
-            beyond = [n for n in taken if (used[n] - self._asked[n]) * (_LIMITS[n].free - self._asked[n]) > 0.0]
+            beyond = self._beyond(taken, used)
             if found := self._without(beyond):
                 taken, used = beyond, found
             left = [n for n in taken if n != name]
             if found := self._without(left):
                 taken, used = left, found
-        return taken, used
+        return self._beyond(taken, used) or taken, used
+
+    def _beyond(self, names: Iterable[str], used: dict[str, float]) -> list[str]:
+        """Limits that a plan does not keep as they were asked for."""
+        return [n for n in names if (used[n] - self._asked[n]) * (_LIMITS[n].free - self._asked[n]) > 0.0]
 
     def way(self) -> dict[str, float] | None:
         """Values of some limits with which there is a plan, as near to what was asked as bisection finds them; None: none."""
         if (smallest := self._smallest()) is None:
             return None
         names, used = smallest
-        values, low, high, share = _free(names), _LEAST, 2.0, 1.0  # under a limit a plan may need more than it took without
+        values, low, high, share = self._shares(names, used, 1.0), _LEAST, 2.0, 1.0  # under a limit a plan may need more than it took without
         for _ in range(_TRIALS):
-            tried = {}
-            for name in names:
-                asked, free = self._asked[name], _LIMITS[name].free
-                tried[name] = sorted((asked, _outward(asked, asked + share * (used[name] - asked)), free))[1]
+            tried = self._shares(names, used, share)
             if self._used(tried):
                 values, high = tried, share
             else:
                 low = share
             share = sqrt(low * high)
+        return values
+
+    def _shares(self, names: Iterable[str], used: dict[str, float], share: float) -> dict[str, float]:
+        """Values of limits: a share of what the plan took beyond them, 1 for all of it."""
+        values = {}
+        for name in names:
+            asked, free = self._asked[name], _LIMITS[name].free
+            values[name] = sorted((asked, _outward(asked, asked + share * (used[name] - asked)), free))[1]
         return values
 
 

@@ -62,6 +62,7 @@ class PowerlinePlanner:
         if not request.with_recovery:
             return PowerlinePlan(perch, None)
         try:
-            return PowerlinePlan(perch, search.fly(search.recovery(replace(request, start=perch.states[-1]), hover)))
+            rest = replace(request, start=perch.states[-1], deadline=began + request.deadline - perf_counter())
+            return PowerlinePlan(perch, search.fly(search.recovery(rest, hover)))
         except PlanningRefusal as refusal:
             return PowerlinePlan(perch, None, str(refusal))

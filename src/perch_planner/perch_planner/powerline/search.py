@@ -171,7 +171,7 @@ class Search:
         margins, wish, intervals, lines, solver_name = task.margins, EASED**first, s.intervals, task.lines, task.request.solver
         iterations, time, cpu_time, patience, worst, previous, phase = 0, 0.0, 0.0, 0.0, None, None, cold
         for attempt in range(first, ATTEMPTS):
-            if time > task.request.deadline:  # a refusal with its cause is worth more than being stopped
+            if attempt > first and time + patience > task.request.deadline:  # a refusal with its cause is worth more than being stopped
                 break
             states, inputs = previous if previous is not None else task.guess(attempt, intervals)
             numbers = Numbers(
