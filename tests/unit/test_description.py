@@ -107,6 +107,14 @@ def test_slow_odometry_and_time_that_begins_anew_are_followed():
     assert [f.stamp for f in out["frames"]] == [0, 100_000_000, 200_000_000, 1000, 50_000_000]
 
 
+@pytest.mark.parametrize("before", [range(5_000_000_000, 7_000_000_000, STEP), [10**18]])
+def test_the_rate_holds_after_stamps_went_back(before):
+    component, out = described()
+    for stamp in (*before, *range(0, 2_000_000_000, STEP)):
+        component.on_odometry(state(stamp))
+    assert len([f for f in out["frames"] if f.stamp < 2_000_000_000]) == pytest.approx(100, abs=2)
+
+
 def test_the_target_is_told_when_it_changes():
     component, out = described()
     for stamp, x in ((1, 1.0), (2, 1.0), (3, 1.5)):

@@ -67,7 +67,7 @@ class Description(Component[DescriptionParameters]):
             self._ahead = state.stamp  # a reader of /tf that has seen the future believes nothing else; where two agree, time has jumped
             self.warn(f"odometry: stamp {state.stamp} ns is ahead of the others: ignored", every=1.0)
             return
-        late = self._next >= 0 and state.stamp < self._next + PERIOD
+        late = 0 <= self._next <= state.stamp < self._next + PERIOD
         self._next = (self._next if late else state.stamp) + PERIOD
         self.frames(StampedTransform(state.stamp, ODOM, BASE, vector3(state.p_WB), _unit(state.q_WB)))
 
