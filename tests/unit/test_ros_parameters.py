@@ -122,6 +122,12 @@ def test_an_accepted_value_counts_at_once_whole_numbers_for_real_ones_too(graph,
     assert (list(config) if isinstance(got, list) else config) == got
 
 
+@pytest.mark.parametrize("name", ["lockstep_timout", "use_sim_timee", "start_type_description_services"])
+def test_names_that_begin_as_a_parameter_of_the_host_are_refused(graph, name):
+    with pytest.raises(ConfigError, match=name):
+        node("mistyped", Tuned).create(context=graph.context, use_global_arguments=False, parameter_overrides=[Parameter(name, value=True)])
+
+
 AUTOPILOTS = {"betaflight": "perch_autopilot.betaflight:Betaflight", "mavlink": "perch_autopilot.mavlink:Mavlink"}
 
 
