@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from typing import Any
 
 from perch_core.component import Component
@@ -52,7 +53,7 @@ class VehicleNode(ComponentNode):
         self._begun = self._progress = self._named = time.monotonic()
         self._dropped: set[str] = set()
         self._gone: set[str] = set()  # whose connection has ended
-        self._undrawn: list[tuple[Publication, CameraImage]] = []
+        self._undrawn: list[tuple[Callable[[CameraImage], None], CameraImage]] = []
         self._pacing: Pacing | None = None
         self._allowance = 0
         self._counted = (time.monotonic(), 0)
@@ -69,13 +70,13 @@ class VehicleNode(ComponentNode):
         self.create_timer(1.0, self._diagnose, clock=self._steady)
 
     def _emitted(self, topic: str, publication: Publication):
-        """Images are published when they have been drawn."""
+        """Images go to neighbours and out when they have been drawn."""
         usual = super()._emitted(topic, publication)
 
         def publish(value: Any) -> None:
             if isinstance(value, CameraImage) and value.ready is not None:
-                if publication.heard():
-                    self._undrawn.append((publication, value))
+                if self.wiring.read_here(topic) or publication.heard():
+                    self._undrawn.append((usual, value))
             else:
                 usual(value)
 
@@ -169,11 +170,11 @@ class VehicleNode(ComponentNode):
 
     def _publish_drawn(self) -> None:
         waiting = []
-        for publication, image in self._undrawn:
+        for publish, image in self._undrawn:
             if image.ready is not None and not image.ready(0.0):
-                waiting.append((publication, image))
+                waiting.append((publish, image))
             elif image.pixels() is not None:
-                publication.send(image)
+                publish(image)
         self._undrawn = waiting
 
     # -- the silent --------------------------------------------------------------------------------------------------

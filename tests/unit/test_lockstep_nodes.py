@@ -1,0 +1,120 @@
+"""Nodes of the lockstep host, with those that share their process or ask them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip("rclpy")
+
+from perch_core.component import Client, Component, Service  # noqa: E402
+from perch_core.ros.arrival import ArrivalNode  # noqa: E402
+from perch_core.ros.node import close_nodes  # noqa: E402
+from perch_core.ros.wiring import Wiring  # noqa: E402
+from perch_core.values import CameraImage  # noqa: E402
+from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
+from perch_sim.ros.participant_node import ParticipantNode  # noqa: E402
+from perch_sim.ros.vehicle_node import VehicleNode  # noqa: E402
+from perch_sim.simulated_vehicle import SimulatedVehicle  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+
+PATIENCE = 120.0  # only ever waited for in full when a test fails [s]
+REQUEST = PerchPlanRequest(start=0, p=np.zeros(3), p_WS=np.array([1.7, 0.0, 0.0]), q_WS=np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """No parameters."""
+
+
+class Asking(Component[Nothing]):
+    """Asks, and keeps the answers."""
+
+    config_type = Nothing
+    plan_perch = Client(PerchPlanRequest, PerchPlan, "plan_perch")
+
+    def __init__(self, config: Nothing) -> None:
+        super().__init__(config)
+        self.answers: list[str] = []
+
+    def on_plan_perch(self, answer) -> None:
+        """Keep it."""
+        self.answers.append(answer.message)
+
+
+class Serving(Component[Nothing]):
+    """Answers when the test does."""
+
+    config_type = Nothing
+    plan_perch = Service(PerchPlanRequest, PerchPlan, "plan_perch")
+
+    def __init__(self, config: Nothing) -> None:
+        super().__init__(config)
+        self.replies: list = []
+
+    def on_plan_perch(self, request, reply) -> None:
+        """Later."""
+        self.replies.append(reply)
+
+
+@pytest.fixture
+def executor(ros_domain):
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+    yield executor
+    close_nodes(executor.get_nodes())
+    rclpy.shutdown(context=context)
+
+
+def created(executor, host, kind, wiring=None, **parameters):
+    """A node of a component."""
+    given = [Parameter(name, value=value) for name, value in parameters.items()]
+    one = host(kind.__name__.lower(), kind, wiring or Wiring(), context=executor.context, parameter_overrides=given)
+    one.connect()
+    executor.add_node(one)
+    return one
+
+
+def participant(executor, kind):
+    """A node in lockstep whose batches the test begins."""
+    wiring = Wiring()
+    wiring.schedule_here = True
+    return created(executor, ParticipantNode, kind, wiring)
+
+
+def until(executor, done):
+    """Run callbacks until `done`."""
+    end = time.monotonic() + PATIENCE
+    while not done():
+        assert time.monotonic() < end, "it does not come"
+        executor.spin_once(0.1)
+
+
+def test_an_image_that_is_drawn_later_is_handed_to_neighbours_once_it_is_drawn(executor):
+    wiring, seen, drawn = Wiring(), [], []
+    wiring.add_reader("/camera_down/image_raw", seen.append)
+    vehicle = created(executor, VehicleNode, SimulatedVehicle, wiring, cameras="none")
+    image = CameraImage(1, "camera", 1, 1, "mono8", lambda _: np.zeros((1, 1), np.uint8), lambda timeout: bool(drawn))
+    vehicle.component.image_down(image)
+    vehicle._publish_drawn()
+    assert not seen
+    drawn.append(True)
+    vehicle._publish_drawn()
+    assert seen == [image]
+
+
+def test_each_of_two_open_requests_gets_its_own_answer(executor):
+    asking, replies, results = participant(executor, Asking), created(executor, ArrivalNode, Serving).component.replies, []
+    for _ in range(2):
+        asking.component.plan_perch(REQUEST, 0)
+    until(executor, lambda: len(replies) == 2)
+    for reply, message in zip(replies, ("first", "second")):
+        reply(PerchPlan(success=False, error_code=2, message=message))
+    asking.participant.begin(1, [])
+    until(executor, lambda: results.append(asking.participant.results()) or results[-1] is not None)
+    assert asking.component.answers == ["first", "second"]
