@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import defaultdict, deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -51,8 +52,8 @@ class ParticipantNode(ComponentNode):
         self.participant.inputs -= {port.channel(self.component) for port in self._observed}
         self._intake = Intake(self)
         self._asking: dict[str, Callable[[Any, int], None]] = {}
-        self._answers: dict[str, Answer] = {}
-        self._asked: dict[str, float] = {}  # channel -> when its last request was made, monotonic clock [s]
+        self._open: defaultdict[str, deque[tuple[Answer, float]]] = defaultdict(deque)
+        """Channel -> its requests without an answer, each with its time on the monotonic clock [s]: a server answers in their order."""
         self._busy = False  # with a batch
         self._vehicle: Any = None  # the connection to it, where there is one
         self._waiting = Waiting()
@@ -155,23 +156,23 @@ class ParticipantNode(ComponentNode):
 
     def _ask(self, channel: str, request: Any) -> Answer:
         """Send a component's request by its service; the answer is handed over by the participant when it counts."""
-        answer = self._answers[channel] = Answer()
-        self._asked[channel] = time.monotonic()
+        answer = Answer()
+        self._open[channel].append((answer, time.monotonic()))
         self._asking[channel](request, 0)
         return answer
 
     def _deliver_answer(self, port: Client, value: Any) -> None:
-        answer = self._answers.get(port.channel(self.component))
-        if answer is not None:
-            answer(value)
+        waiting = self._open[port.channel(self.component)]
+        if waiting:
+            waiting.popleft()[0](value)
         self._progress()
 
     def _give_up(self) -> None:
         """A request that was under way when its server ended is never answered; the flight must not wait for ever."""
-        for channel, answer in self._answers.items():
-            if not answer.done() and time.monotonic() - self._asked[channel] > ANSWERED:
+        for channel, waiting in tuple(self._open.items()):
+            if waiting and time.monotonic() - waiting[0][1] > ANSWERED:
                 self.get_logger().error(f"{channel} has not answered for {ANSWERED:g} s: its answer is given up")
-                answer(Unavailable(f"{channel} has not answered within {ANSWERED:g} s"))
+                waiting.popleft()[0](Unavailable(f"{channel} has not answered within {ANSWERED:g} s"))
                 self._progress()
 
     def _progress(self) -> None:
