@@ -10,15 +10,18 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
-from perch_core.component import Client, Component, Service  # noqa: E402
+from perch_core.component import Action, Client, Component, Service  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.node import close_nodes  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
-from perch_core.values import CameraImage  # noqa: E402
+from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult  # noqa: E402
 from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
+from perch_msgs.action import Perch  # noqa: E402
+from perch_msgs.srv import PlanPerch  # noqa: E402
 from perch_sim.ros.participant_node import ParticipantNode  # noqa: E402
 from perch_sim.ros.vehicle_node import VehicleNode  # noqa: E402
 from perch_sim.simulated_vehicle import SimulatedVehicle  # noqa: E402
+from rclpy.action import ActionClient  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 
@@ -118,3 +121,36 @@ def test_each_of_two_open_requests_gets_its_own_answer(executor):
     asking.participant.begin(1, [])
     until(executor, lambda: results.append(asking.participant.results()) or results[-1] is not None)
     assert asking.component.answers == ["first", "second"]
+
+
+class Failing(Component[Nothing]):
+    """Fails on whatever it is asked for."""
+
+    config_type = Nothing
+    plan_perch = Service(PerchPlanRequest, PerchPlan, "plan_perch")
+    perch = Action(PerchGoal, PerchFeedback, PerchResult, "perch")
+
+    def on_plan_perch(self, request, reply) -> None:
+        """A defect."""
+        raise ZeroDivisionError("no request is foreseen")
+
+    def on_perch(self, goal) -> str:
+        """A defect."""
+        raise ZeroDivisionError("no goal is foreseen")
+
+
+@pytest.mark.parametrize("make", [participant, lambda executor, kind: created(executor, ArrivalNode, kind)], ids=["lockstep", "arrival"])
+def test_requests_and_goals_that_a_component_fails_on_are_answered(executor, make):
+    node = make(executor, Failing)
+    planner, mission = node.create_client(PlanPerch, "plan_perch"), ActionClient(node, Perch, "perch")
+    until(executor, lambda: planner.service_is_ready() and mission.server_is_ready())
+
+    def answer(future):
+        until(executor, future.done)
+        return future.result()
+
+    refusal = answer(planner.call_async(PlanPerch.Request()))
+    assert (refusal.success, refusal.message) == (False, "no request is foreseen")
+    for _ in range(2):
+        handle = answer(mission.send_goal_async(Perch.Goal()))
+        assert handle.accepted and answer(handle.get_result_async()).result.message == "no goal is foreseen"

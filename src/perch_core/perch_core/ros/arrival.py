@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from perch_core.component import Client, Component, Input, Service, Wake, ports
+from perch_core.component import Action, Client, Component, Input, Service, Wake, ports
 from perch_core.ros.asking import connect_clients
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.deadlines import Deadlines
@@ -69,13 +69,9 @@ class ArrivalNode(ComponentNode):
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
-    def request(self, port: Service[Any, Any], request: Any, reply: Callable[[Any], None]) -> None:
+    def bring(self, port: Service[Any, Any] | Action, work: Callable[..., None], *arguments: Any) -> None:
         """As it comes."""
-        self.wiring.enter(self.guarded, port.name, port.handler(self.component), request, reply)
-
-    def goal(self, port: Any, goal: Any) -> None:
-        """As it comes."""
-        self.wiring.enter(self.guarded, port.name, self.begin_goal, port, goal)
+        self.wiring.enter(self.guarded, port.name, work, *arguments)
 
     def _deliver_answer(self, port: Client[Any, Any], answer: Any) -> None:
         self.wiring.enter(self.guarded, port.name, port.handler(self.component), answer)

@@ -154,7 +154,7 @@ class ComponentNode(Node):
                 self.refused(channel, error)
                 answer(self._bad_request(row, str(error)))
                 return
-            self.request(port, value, lambda reply: answer(row.answer_message(reply)))
+            self.bring(port, self.begin_request, port, row, value, answer)
 
         LateService(self, row.type, channel, take)
 
@@ -178,23 +178,40 @@ class ComponentNode(Node):
 
         def begin(handle: Any) -> None:
             goal = self._goals[port.name] = ServedGoal(server, handle, row)
-            self.goal(port, goal)
+            self.bring(port, self.begin_goal, port, goal)
 
         server = GoalServer(self, row.type, channel, begin, accept)
 
+    def begin_request(self, port: Service[Any, Any], row: topics.ServiceRow, request: Any, answer: Callable[[Any], None]) -> None:
+        """Hand a request to the component; one that it fails on before its answer is refused."""
+        answered = False
+
+        def reply(value: Any) -> None:
+            nonlocal answered
+            answer(row.answer_message(value))
+            answered = True
+
+        try:
+            port.handler(self.component)(request, reply)
+        except Exception as error:
+            if not answered:
+                answer(self._bad_request(row, str(error)))
+            raise
+
     def begin_goal(self, port: Action, goal: ServedGoal) -> None:
-        """Hand a goal to the component; one that it rejects ends at once."""
-        why = port.handler(self.component)(goal)
+        """Hand a goal to the component; one that it rejects or fails on ends at once."""
+        try:
+            why = port.handler(self.component)(goal)
+        except Exception as error:
+            if not goal.finished:
+                goal.reject(str(error))
+            raise
         if why:
             self.get_logger().warning(f"{port.name}: goal rejected: {why}")
             goal.reject(why)
 
-    def request(self, port: Service[Any, Any], request: Any, reply: Callable[[Any], None]) -> None:
-        """Bring a request to the component."""
-        raise NotImplementedError
-
-    def goal(self, port: Action, goal: ServedGoal) -> None:
-        """Bring a goal to the component."""
+    def bring(self, port: Service[Any, Any] | Action, work: Callable[..., None], *arguments: Any) -> None:
+        """Bring a request or a goal to the component: call `work` when it is its turn."""
         raise NotImplementedError
 
     def connect(self) -> None:

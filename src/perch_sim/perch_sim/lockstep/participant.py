@@ -215,7 +215,7 @@ class LocalParticipant(Participant):
     def request(self, port_name: str, request: Any, reply: Callable[[Any], None]) -> None:
         """A request to a service of the component: in front of the next batch; at once as long as there has been none."""
         handler = self._port(Service, port_name).handler(self.component)
-        self._from_outside(lambda: handler(request, reply))
+        self.enter(port_name, lambda: handler(request, reply))
 
     def goal(self, port_name: str, goal: Any, answered: Callable[[str], None] | None = None) -> None:
         """A goal for an action of the component, as `request`.
@@ -232,9 +232,16 @@ class LocalParticipant(Participant):
             if answered is not None:
                 answered(rejected)
 
+        self.enter(port_name, hand_over)
+
+    def enter(self, port_name: str, call: Callable[[], None]) -> None:
+        """Call what hands a request or a goal to the port, as `request`."""
         if port_name == self._hold:
             self._hold = ""
-        self._from_outside(hand_over)
+        if self._begun:
+            self._outside.append(call)
+        else:
+            call()
 
     def serves(self, channel: str) -> str | None:
         """The name of the service with this channel; None: there is none."""
@@ -245,12 +252,6 @@ class LocalParticipant(Participant):
             if port.name == name:
                 return port
         raise PerchError(f"{self.name}: {name!r} is none of its ports of type {kind.__name__}")
-
-    def _from_outside(self, call: Callable[[], None]) -> None:
-        if self._begun:
-            self._outside.append(call)
-        else:
-            call()
 
     def _client(self, port: Client[Any, Any]) -> Callable[..., None]:
         channel, take = port.channel(self.component), port.handler(self.component)

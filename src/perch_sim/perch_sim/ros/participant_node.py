@@ -14,7 +14,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from perch_core.component import Client, Component, Input, Service, Unavailable, ports
+from perch_core.component import Action, Client, Component, Input, Service, Unavailable, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.asking import connect_clients
@@ -137,19 +137,10 @@ class ParticipantNode(ComponentNode):
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
-    def request(self, port: Service, request: Any, reply: Callable[[Any], None]) -> None:
-        """In front of the next batch."""
-        self.participant.request(port.name, request, reply)
-
-    def goal(self, port: Any, goal: Any) -> None:
-        """In front of the next batch, which it may have been waited for."""
-        self.participant.goal(port.name, goal, partial(self._answered, goal))
+    def bring(self, port: Service | Action, work: Callable[..., None], *arguments: Any) -> None:
+        """In front of the next batch, which may have waited for it."""
+        self.participant.enter(port.name, partial(self.guarded, port.name, work, *arguments))
         self._progress()
-
-    @staticmethod
-    def _answered(goal: Any, why: str) -> None:
-        if why:
-            goal.reject(why)
 
     def _client_ports(self) -> list[Client]:
         return list(ports(type(self.component), Client))
