@@ -10,7 +10,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
-from perch_core.component import Action, Client, Component, Service  # noqa: E402
+from perch_core.component import Action, Client, Component, Service, Wake  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.node import close_nodes  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
@@ -154,3 +154,32 @@ def test_requests_and_goals_that_a_component_fails_on_are_answered(executor, mak
     for _ in range(2):
         handle = answer(mission.send_goal_async(Perch.Goal()))
         assert handle.accepted and answer(handle.get_result_async()).result.message == "no goal is foreseen"
+
+
+class Shaky(Asking):
+    """Fails on its first answer and at every tick."""
+
+    tick = Wake(0.1)
+
+    def on_plan_perch(self, answer) -> None:
+        """Keep it; a defect."""
+        super().on_plan_perch(answer)
+        if len(self.answers) == 1:
+            raise ZeroDivisionError("no answer is foreseen")
+
+    def on_tick(self, now: int) -> None:
+        """A defect."""
+        raise ZeroDivisionError("no tick is foreseen")
+
+
+def test_a_batch_that_waited_and_fails_is_finished_with_the_answers_after(executor):
+    shaky, service, results = participant(executor, Shaky), created(executor, ArrivalNode, Serving), []
+    for _ in range(2):
+        shaky.component.plan_perch(REQUEST, 0)
+    shaky.participant.begin(1, [])
+    assert shaky.participant.results() is None
+    until(executor, lambda: len(service.component.replies) == 2)
+    for reply, message in zip(service.component.replies, ("first", "second")):
+        reply(PerchPlan(success=False, error_code=2, message=message))
+    until(executor, lambda: results.append(shaky.participant.results()) or results[-1] is not None)
+    assert results[-1] == [] and shaky.component.answers == ["first", "second"]

@@ -201,9 +201,8 @@ class LocalParticipant(Participant):
     def _take_what_came(self) -> None:
         while self._outside:
             self._outside.popleft()()
-        due = [awaited for awaited in self._awaited if awaited.due <= self._now]
-        self._awaited = [awaited for awaited in self._awaited if awaited.due > self._now]
-        for awaited in due:
+        for awaited in [awaited for awaited in self._awaited if awaited.due <= self._now]:
+            self._awaited.remove(awaited)  # one by one: where the component fails on one, the others remain
             try:
                 answer = awaited.answer.result()
             except Exception as error:  # whatever befell a server, it is no answer

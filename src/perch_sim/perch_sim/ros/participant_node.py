@@ -23,7 +23,7 @@ from perch_core.ros.intake import Intake
 from perch_core.ros.priority import priority
 from perch_core.ros.wiring import Wiring
 from perch_core.values import Serialized
-from perch_sim.lockstep import Answer, LocalParticipant, is_slow
+from perch_sim.lockstep import Answer, LocalParticipant, Packet, is_slow
 from perch_sim.lockstep.link import Waiting, address, knock, pack, unpack
 from rclpy.clock import Clock, ClockType
 
@@ -48,6 +48,7 @@ class ParticipantNode(ComponentNode):
         self.declare_parameter("lockstep", True)
         self.participant = LocalParticipant(self.component, codec=topics, ask=self._ask, hold=hold, name=name)
         self.participant.begin = partial(self.guarded, "step", self.participant.begin)  # type: ignore[method-assign]
+        self.participant.results = partial(self._results, self.participant.results)  # type: ignore[method-assign]
         self._observed = [port for port in ports(component, Input) if port.channel(self.component) in OBSERVED and port.value is Serialized]
         self.participant.inputs -= {port.channel(self.component) for port in self._observed}
         self._intake = Intake(self)
@@ -128,6 +129,14 @@ class ParticipantNode(ComponentNode):
             return
         if waited:
             self.wiring.from_thread(self._work_on)
+
+    def _results(self, results: Callable[[], list[Packet] | None]) -> list[Packet] | None:
+        """Those of the participant; what raises is said and dropped, and the rest goes on."""
+        while True:
+            try:
+                return results()
+            except Exception as error:
+                self.refused("step", error)
 
     def _leave(self) -> None:
         """The vehicle has gone; another one may come."""
