@@ -35,11 +35,6 @@ class Bounds(NamedTuple):
     upper: Array
 
 
-NONE = Bounds(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64), np.empty((0, 3)), np.empty(0),
-              np.empty(0))
-"""No bounds."""
-
-
 @compiled
 def no_bounds(terms: int, rows: int) -> BoundArrays:
     """Arrays of `Bounds` to be filled in: so many terms of weight zero, so many rows without bounds."""

@@ -85,8 +85,5 @@ def _refusal(best: Outcome | None, search: Search, limits: Limits, mass: float) 
         return PerchRefusal(refusals.THRUST_FLOOR, "thrust range [M:eq16]", -np.inf, "no way out: no stop keeps the thrust within its range",
                             iterations=search.iterations)
     proofs = certificates(best.results, limits, mass)
-    broken = next((proof for proof in proofs if not proof.holds), None)
-    if broken is None:
-        return PerchRefusal(refusals.THRUST_FLOOR, "thrust range of the single rotors", -np.inf,
-                            "no way out: no stop keeps each rotor's thrust within its range", proofs, search.iterations)
+    broken = next(proof for proof in proofs if not proof.holds)
     return PerchRefusal(_CODES.get(broken.quantity, refusals.BOX), broken.quantity, broken.margin, f"no way out: {broken}", proofs, search.iterations)
