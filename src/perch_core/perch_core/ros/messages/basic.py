@@ -12,10 +12,9 @@ from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS
 
 
-def to_stamp(time: int | float) -> Time:
-    """Stamp of a time in nanoseconds (int) or in seconds (float)."""
-    ns = time if isinstance(time, int) else round(time * NANOSECONDS)
-    return Time(sec=int(ns // NANOSECONDS), nanosec=int(ns % NANOSECONDS))
+def to_stamp(stamp: int) -> Time:
+    """Message of a stamp [ns]."""
+    return Time(sec=int(stamp // NANOSECONDS), nanosec=int(stamp % NANOSECONDS))
 
 
 def stamp_value(stamp: Time) -> int:
