@@ -41,7 +41,7 @@ def test_it_obeys_the_balance_of_forces(span, rise, stiffness):
     """z'' = (w/H) sqrt(1 + z'^2), integrated from one support with the cable's own slope there."""
     tension, weight = stiffness * span * 3.0, 3.0
     cable = Catenary([0, 0, 10], [span, 0, 10 + rise * span], tension / weight)
-    t = cable.tangent(0.0)
+    t = cable.point(1e-4) - cable.point(-1e-4)
     flown = solve_ivp(lambda x, y: [y[1], weight / tension * math.sqrt(1 + y[1] ** 2)], [0, span],
                       [10.0, t[2] / t[0]], rtol=1e-10, atol=1e-10, dense_output=True)
     points = cable.sample(50)
@@ -54,22 +54,6 @@ def test_length_is_the_integral_along_the_curve_and_arc_length_is_its_parameter(
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert steps.sum() == pytest.approx(cable.length, rel=1e-5)
     np.testing.assert_allclose(steps, cable.length / 4000, rtol=2e-3)
-
-
-@given(cables(), st.floats(0.05, 0.95))
-def test_tangent_is_the_derivative(cable, where):
-    s, h = where * cable.length, 1e-5 * cable.length
-    numeric = (cable.point(s + h) - cable.point(s - h)) / (2 * h)
-    np.testing.assert_allclose(cable.tangent(s), numeric, atol=1e-6)
-
-
-def test_wind_swings_the_cable_about_its_chord():
-    start, end = np.array([0.0, 0.0, 10.0]), np.array([40.0, 0.0, 10.0])
-    load = np.array([0.0, 0.4, -1.0])
-    still, blown = Catenary.from_sag(start, end, 1.5), Catenary.from_sag(start, end, 1.5, load)
-    assert blown.length == pytest.approx(still.length)
-    middle = blown.point(blown.length / 2) - (start + end) / 2
-    np.testing.assert_allclose(middle, 1.5 * load / np.linalg.norm(load), atol=1e-9)
 
 
 def test_no_sag_is_a_straight_line_even_a_vertical_one():
@@ -96,7 +80,7 @@ def test_stated_errors_of_a_fit_are_its_errors(cable, count):
     assert sampled.max() >= 0.98 * fit.max_error - 1e-9
     if fit.max_error < 0.02 * cable.length / count:  # else distance along the cable and along the chord differ
         assert sampled.mean() == pytest.approx(fit.mean_error, rel=0.02, abs=1e-9)
-    assert len(fit.segments(0.03, 5)) == count and fit.segments(0.03, 5)[-1].id == 4 + count
+    assert len(fit.vertices) == count + 1
 
 
 @pytest.mark.parametrize("rise", [0.0, 8.0])

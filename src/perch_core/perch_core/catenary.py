@@ -7,16 +7,13 @@ parameter a = H/w: horizontal tension over weight per length. Arc length is clos
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from perch_core.arrays import Array, Numbers
+from perch_core.arrays import Array
 from perch_core.errors import PerchError
-from perch_core.lines import Segment
-
-DOWN = (0.0, 0.0, -1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,21 +23,18 @@ class Catenary:
     Attributes:
         start, end: supports in W [m], shape (3,).
         parameter: a = H/w [m]; inf is a straight cable.
-        down: unit vector of the load in W, shape (3,): gravity, or gravity and steady wind together.
     """
 
     start: Array
     end: Array
     parameter: float
-    down: Array = field(default_factory=lambda: np.array(DOWN))
 
     def __post_init__(self) -> None:
-        for name in ("start", "end", "down"):
+        for name in ("start", "end"):
             vector = np.array(getattr(self, name), dtype=float)
             if vector.shape != (3,) or not np.all(np.isfinite(vector)):
                 raise PerchError(f"cable: {name} needs three finite numbers, got {getattr(self, name)!r}")
             object.__setattr__(self, name, vector)
-        object.__setattr__(self, "down", self.down / np.linalg.norm(self.down))
         if not np.linalg.norm(self.end - self.start) > 0:
             raise PerchError(f"cable: both ends are at {self.start.tolist()} m")
         if not self.parameter > 0:
@@ -51,7 +45,7 @@ class Catenary:
             raise PerchError(f"cable: parameter {self.parameter:g} m is too small for a span of {self._span:g} m")
 
     @classmethod
-    def from_sag(cls, start: Array, end: Array, sag: float, down: Numbers = DOWN) -> Catenary:
+    def from_sag(cls, start: Array, end: Array, sag: float) -> Catenary:
         """The cable whose middle (of the span) hangs `sag` [m] below the chord.
 
         Raises:
@@ -59,30 +53,34 @@ class Catenary:
         """
         if not (math.isfinite(sag) and sag >= 0):
             raise PerchError(f"cable: sag {sag!r} is not a length >= 0 m")
-        down = np.array(down, float)
-        straight = cls(start, end, math.inf, down)
+        straight = cls(start, end, math.inf)
         if sag < 1e-9:
             return straight
         span = straight._span
         if not span > 1e-6:
             raise PerchError(f"cable: a sag of {sag:g} m needs ends that are not one above the other")
-        largest = cls(start, end, span / 60.0, down).sag
+        largest = cls(start, end, span / 60.0).sag
         if sag > largest:
             raise PerchError(f"cable: sag {sag:g} m is outside [0, {largest:g}] m for a span of {span:g} m")
         from scipy.optimize import brentq  # 0.2 s of the start of a node that hangs no cable
 
-        log_a = brentq(lambda x: math.log(cls(start, end, math.exp(x), down).sag / sag),
+        log_a = brentq(lambda x: math.log(cls(start, end, math.exp(x)).sag / sag),
                        math.log(span / 60.0), math.log(span * straight.length / sag + span) + 2.0, xtol=1e-14)
-        return cls(start, end, math.exp(log_a), down)
+        return cls(start, end, math.exp(log_a))
 
     @property
     def _rise(self) -> float:
-        return float(-(self.end - self.start) @ self.down)
+        return float(self.end[2] - self.start[2])
+
+    @property
+    def _across(self) -> Array:
+        """From start to end along the horizontal [m], shape (3,)."""
+        x, y, _ = self.end - self.start
+        return np.array([x, y, 0.0])
 
     @cached_property
     def _span(self) -> float:
-        chord = self.end - self.start
-        return float(np.linalg.norm(chord - (chord @ self.down) * self.down))
+        return float(np.linalg.norm(self._across))
 
     @cached_property
     def _x0(self) -> float:
@@ -115,9 +113,7 @@ class Catenary:
         a, x0 = self.parameter, self._x0
         # cosh(p) - cosh(q) as a product: a is often a thousand times the sag
         z = 2 * a * np.sinh((x - 2 * x0) / (2 * a)) * np.sinh(x / (2 * a))
-        chord = self.end - self.start
-        along = (chord - (chord @ self.down) * self.down) / self._span
-        return self.start + x[..., None] * along - z[..., None] * self.down
+        return self.start + x[..., None] * (self._across / self._span) + z[..., None] * np.array([0.0, 0.0, 1.0])
 
     def _x_of(self, s: Array) -> Array:
         a, x0 = self.parameter, self._x0
@@ -130,19 +126,10 @@ class Catenary:
             return self.start + (s / self.length)[..., None] * (self.end - self.start)
         return self._at(self._x_of(s))
 
-    def tangent(self, s: Array | float) -> Array:
-        """Unit tangents in W at arc lengths s [m]: shape (...) -> (..., 3)."""
-        s = np.asarray(s, dtype=float)
-        if self.straight:
-            return np.broadcast_to((self.end - self.start) / self.length, (*s.shape, 3)).copy()
-        angle = np.arctan(s / self.parameter - math.sinh(self._x0 / self.parameter))
-        chord = self.end - self.start
-        along = (chord - (chord @ self.down) * self.down) / self._span
-        return np.cos(angle)[..., None] * along - np.sin(angle)[..., None] * self.down
-
     def sample(self, count: int) -> Array:
         """`count` points in W from start to end, evenly spread along the cable [m], shape (count, 3)."""
         return self.point(np.linspace(0.0, self.length, count))
+
 
 @dataclass(frozen=True, eq=False)
 class SegmentFit:
@@ -157,11 +144,6 @@ class SegmentFit:
     vertices: Array
     max_error: float
     mean_error: float
-
-    def segments(self, radius: float, first_id: int = 0) -> list[Segment]:
-        """The pieces as lines of a map, numbered from `first_id`."""
-        return [Segment.between(a, b, radius, first_id + i)
-                for i, (a, b) in enumerate(zip(self.vertices[:-1], self.vertices[1:]))]
 
 
 def fit_segments(cable: Catenary, count: int) -> SegmentFit:
