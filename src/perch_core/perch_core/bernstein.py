@@ -94,13 +94,6 @@ def derivative(coefficients: Array, order: int = 1) -> Array:
     return coefficients
 
 
-def integral(coefficients: Array) -> Array:
-    """Coefficients of the antiderivative that vanishes at s = 0, shape (..., degree + 2)."""
-    coefficients = np.asarray(coefficients, float)
-    sums = np.cumsum(coefficients, axis=-1) / coefficients.shape[-1]
-    return np.concatenate([np.zeros_like(sums[..., :1]), sums], axis=-1)
-
-
 @lru_cache(maxsize=None)
 def elevation_matrix(degree: int, to_degree: int) -> Array:
     """Matrix E with `elevated = coefficients @ E.T`, shape (to_degree + 1, degree + 1), read-only.

@@ -127,13 +127,6 @@ class FlatTrajectory:
         values = np.einsum("koda,ka->kod", self._tables[[i for i, _ in places]], rows)
         return FlatSample(*(values[:, order, :3] for order in range(5)), *(values[:, order, 3] for order in range(3)))
 
-    def derivative(self, t: float, order: int) -> Array:
-        """Derivative of any order of (x, y, z, yaw) at a time, shape (4,)."""
-        index, s = self.locate(t)
-        local = bernstein.derivative(self.coefficients[index], order)
-        values: Array = bernstein.evaluate(local, s) / self.durations[index] ** order
-        return values
-
 
 @dataclass(frozen=True, slots=True)
 class StateSample:
