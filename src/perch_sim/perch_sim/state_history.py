@@ -62,14 +62,6 @@ class StateHistory:
         p, q = between([(a, b, s)])
         return TrueState(time, np.concatenate([p[0], q[0], a.x[7:] + s * (b.x[7:] - a.x[7:])]))
 
-    def poses(self, times: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (n, 3) [m] and attitudes xyzw (n, 4) at n times [ns], as `at` has them, in a fraction of its time.
-
-        Raises:
-            LookupError: a time lies outside the history.
-        """
-        return between([self.around(time) for time in times])
-
     def around(self, time: int) -> Place:
         """The states before and after a time [ns], and the share of the way from one to the other.
 
