@@ -15,7 +15,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
-from perch_sim.rendering import Box, Renderer, Scene
+from perch_sim.rendering import Renderer, Scene
 from perch_sim.rendering.sensor import PSF_SIGMA
 from unit.camera_mounts import looking_along
 
@@ -130,7 +130,7 @@ def test_threads_may_share_a_renderer():
 def test_every_attitude_and_place_shows_the_room_or_the_panel(mount):
     """No void: in a closed room every ray of the lens ends on something, textured and lit."""
     rng = np.random.default_rng(7)
-    scene = make_scene(120.0, boxes=(Box(np.array([2.5, 1.5, 0.4]), np.eye(3), (0.8, 0.8, 0.8)),))
+    scene = make_scene(120.0)
     renderer = Renderer(scene, mount)
     for _ in range(8):
         p_WB, R_WB = rng.uniform([-3.5, -2, 0.3], [5.5, 2, 3.7]), Rotation.random(random_state=rng).as_matrix()

@@ -88,8 +88,8 @@ def test_width_in_the_image_is_the_wires_width(radius):
 def test_a_panel_hides_what_is_behind_it_and_nothing_else():
     behind, before = straight([5, -4, 2.2], [5, 4, 2.2], 0.03), straight([2, -4, 1.8], [2, 4, 1.8], 0.03)
     panel = PerchSurface.from_inclination([3, 0, 2], np.pi / 2, size=(2.0, 1.0))
-    shown = light(plain_room(behind, before, panels=(panel,)), PINHOLE)
-    bare = light(plain_room(panels=(panel,)), PINHOLE)
+    shown = light(plain_room(behind, before, target=panel), PINHOLE)
+    bare = light(plain_room(target=panel), PINHOLE)
     difference = np.abs(shown - bare)
     row_behind, row_before = (int(240 - PINHOLE.fy * dz / x) for dz, x in ((0.2, 5), (-0.2, 2)))
     left, right = (int(320 + PINHOLE.fx * y / 3.0) for y in (-0.5, 0.5))

@@ -1,4 +1,4 @@
-"""What the cameras see: a room, the inclined panel with its pad, further panels and boxes, cables.
+"""What the cameras see: a room, the inclined panel with its pad, cables.
 
 A `Scene` is a frozen description; `Scene.faces()` breaks it into the flat rectangles that are drawn.
 """
@@ -18,15 +18,6 @@ PAD_THICKNESS = 2e-3  # the pad lies in the perching plane, the panel that carri
 FLOOR_TEXEL, WALL_TEXEL, PANEL_TEXEL = 2.5e-3, 4e-3, 2.5e-3  # the floor is seen from the closest [m]
 ROOM_TEXELS = 25e6  # a large room gets coarser textures, so that memory and start stay small
 PAD_TEXELS_PER_MODULE = 32  # of a tag's 8 x 8 modules: every printed edge falls on a texel's border
-
-
-@dataclass(frozen=True, eq=False)
-class Box:
-    """A textured box. `p_WO` is its centre in W [m], `R_WO` its attitude, `size` its full extent [m]."""
-
-    p_WO: np.ndarray
-    R_WO: np.ndarray
-    size: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +43,7 @@ class Face:
         centre_W: [m], shape (3,).
         right_W, up_W: unit axes of the texture, shape (3,); the normal is right x up.
         half: half extents along right and up [m].
-        kind: `room`, `panel`, `box` or `pad`.
+        kind: `room`, `panel` or `pad`.
         texel: size of a texel [m].
         bounded: whether the rectangle ends at its edges; a room's faces are ended by each other.
         moving: whether it moves with the target.
@@ -81,8 +72,6 @@ class Scene:
         room_low, room_high: opposite corners of the room in W [m], shape (3,).
         target: the panel that carries the pad (its `size` is the panel's), or None.
         board: the tags on the pad, in the middle of the target panel.
-        panels: further panels, textured on both sides.
-        boxes: further boxes.
         cables: cables.
         contrast: Michelson contrast of the textures: 99 % of the texels lie within mean (1 +- contrast).
         light: brightness of the light; 1 is what the cameras' default exposure is made for.
@@ -93,8 +82,6 @@ class Scene:
     room_high: np.ndarray
     target: PerchSurface | None = None
     board: TagBoard | None = None
-    panels: tuple[PerchSurface, ...] = ()
-    boxes: tuple[Box, ...] = ()
     cables: tuple[CableCurve, ...] = ()
     contrast: float = 0.25
     light: float = 1.0
@@ -116,28 +103,24 @@ class Scene:
         """All rectangles, the six of the room first."""
         faces = list(_room_faces(self.room_low, self.room_high))
         if self.target is not None:
-            faces += _panel_faces(self.target, depth=PAD_THICKNESS if self.board else 0.0, moving=True)
+            faces += _panel_faces(self.target, depth=PAD_THICKNESS if self.board else 0.0)
         if self.board is not None and self.target is not None:
             pad = PerchSurface(self.target.p_WS, self.target.R_WS, self.board.pad_size)
             texel = self.board.tags[0].size / self.board.modules / PAD_TEXELS_PER_MODULE
-            faces.append(_surface_face(pad, "pad", texel, moving=True))
-        for panel in self.panels:
-            faces += _panel_faces(panel, depth=0.0, moving=False)
-        for box in self.boxes:
-            faces += _box_faces(box)
+            faces.append(_surface_face(pad, "pad", texel))
         return tuple(faces)
 
 
-def _surface_face(surface: PerchSurface, kind: str, texel: float, moving: bool) -> Face:
+def _surface_face(surface: PerchSurface, kind: str, texel: float) -> Face:
     s1, s2 = surface.R_WS[:, 0], surface.R_WS[:, 1]
-    return Face(surface.p_WS, -s2, s1, (surface.size[1] / 2, surface.size[0] / 2), kind, texel, moving=moving)
+    return Face(surface.p_WS, -s2, s1, (surface.size[1] / 2, surface.size[0] / 2), kind, texel, moving=True)
 
 
-def _panel_faces(panel: PerchSurface, depth: float, moving: bool) -> list[Face]:
+def _panel_faces(panel: PerchSurface, depth: float) -> list[Face]:
     """Front and back of a thin panel whose front lies `depth` behind the surface's plane."""
     centre = panel.p_WS - depth * panel.normal
-    front = _surface_face(PerchSurface(centre, panel.R_WS, panel.size), "panel", PANEL_TEXEL, moving)
-    back = Face(centre, -front.right_W, front.up_W, front.half, "panel", WALL_TEXEL, moving=moving)
+    front = _surface_face(PerchSurface(centre, panel.R_WS, panel.size), "panel", PANEL_TEXEL)
+    back = Face(centre, -front.right_W, front.up_W, front.half, "panel", WALL_TEXEL, moving=True)
     return [front, back]
 
 
@@ -155,17 +138,4 @@ def _room_faces(low: np.ndarray, high: np.ndarray) -> list[Face]:
         where[axis] += side * half[axis]
         texel = coarser * (FLOOR_TEXEL if axis == 2 and side < 0 else WALL_TEXEL)
         faces.append(Face(where, right, up, (abs(right) @ half, abs(up) @ half), "room", texel, bounded=False))
-    return faces
-
-
-def _box_faces(box: Box) -> list[Face]:
-    """Six faces, normals outward."""
-    half = np.array(box.size) / 2
-    faces = []
-    for axis in range(3):
-        for side in (1.0, -1.0):
-            a, b = (axis + 1) % 3, (axis + 2) % 3
-            right, up = box.R_WO[:, a] * side, box.R_WO[:, b]  # right x up = side * axis
-            centre = box.p_WO + side * half[axis] * box.R_WO[:, axis]
-            faces.append(Face(centre, right, up, (half[a], half[b]), "box", WALL_TEXEL))
     return faces
