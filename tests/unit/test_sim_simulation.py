@@ -122,9 +122,9 @@ def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_onl
     try:
         assert eventually(drawing.ready)
         assert images(drawing) == images(DrawnOnDemand(SCENARIO, 3, ("front",)))
-        os.kill(drawing.process_ids["front"], signal.SIGINT)  # Ctrl-C in the terminal is the vehicle's matter
+        os.kill(drawing._draftsmen["front"].process.pid, signal.SIGINT)  # Ctrl-C in the terminal is the vehicle's matter
         assert len(images(drawing, 1)) == 1
-        os.kill(drawing.process_ids["front"], signal.SIGKILL)
+        os.kill(drawing._draftsmen["front"].process.pid, signal.SIGKILL)
         flight = Simulation(SCENARIO, 3, drawing)
         camera, frames = flight.cameras["front"], 0
         while frames < 2:
@@ -142,7 +142,7 @@ def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_onl
 def test_a_process_that_ends_before_it_has_drawn_anything_holds_nobody_up():
     drawing = DrawnInProcesses(SCENARIO, 3, ("front",))
     try:
-        os.kill(drawing.process_ids["front"], signal.SIGKILL)  # Python itself takes longer to start than this to come
+        os.kill(drawing._draftsmen["front"].process.pid, signal.SIGKILL)  # Python itself takes longer to start than this to come
         assert eventually(drawing.ready)
     finally:
         drawing.close()

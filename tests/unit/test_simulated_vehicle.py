@@ -136,7 +136,7 @@ def test_images_that_processes_draw_are_waited_for_and_a_camera_whose_process_en
         while not image.ready(1.0):
             pass
         assert np.array_equal(image.pixels(), on_demand["image_front"][0].pixels())
-        os.kill(drawn._drawing.process_ids["front"], signal.SIGKILL)
+        os.kill(drawn._drawing._draftsmen["front"].process.pid, signal.SIGKILL)
         while schedule.index < 250:
             if not schedule.advance():
                 assert schedule.await_image(1.0)

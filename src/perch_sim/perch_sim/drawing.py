@@ -146,11 +146,6 @@ class DrawnInProcesses:
         """Whether every process has laid out its textures and drawn a first image, or has ended."""
         return all(draftsman.ready() for draftsman in self._draftsmen.values())
 
-    @property
-    def process_ids(self) -> dict[str, int]:
-        """Of each camera's process."""
-        return {name: draftsman.process.pid for name, draftsman in self._draftsmen.items()}
-
     def close(self) -> None:
         """End the processes."""
         for draftsman in self._draftsmen.values():
