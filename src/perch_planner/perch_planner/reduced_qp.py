@@ -13,8 +13,6 @@ on matrices this small they are as fast as array expressions, and numba compiles
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from perch_core.arrays import Array, Flags, Indices
@@ -23,27 +21,16 @@ from perch_planner.bounds import bernstein_row
 from perch_planner.reference_element import BUBBLES, DEGREE, FUNCTIONS, HERMITE, TABLES
 
 ProgramArrays = tuple[Array, Indices, float, Array, Array]
-"""Fields of `ReducedProgram`."""
+"""A reduced program: coordinates w in which every equality holds and the cost is |w|^2: unknowns = centre + spread' w.
+
+    durations: of the segments [s], shape (f,).
+    first: index of the first bubble of each segment among all unknowns, -1 where it has none, shape (f,).
+    time_unit: mean segment duration, in which unknowns are measured [s].
+    spread: shape (size, n).
+    centre: all unknowns at the unconstrained optimum, shape (n, 3).
+"""
 
 _POSITIONS = TABLES[0].T.copy()
-
-
-class ReducedProgram(NamedTuple):
-    """Coordinates w in which every equality holds and the cost is |w|^2: unknowns = centre + spread' w.
-
-    Attributes:
-        durations: of the segments [s], shape (f,).
-        first: index of the first bubble of each segment among all unknowns, -1 where it has none, shape (f,).
-        time_unit: mean segment duration, in which unknowns are measured [s].
-        spread: shape (size, n).
-        centre: all unknowns at the unconstrained optimum, shape (n, 3).
-    """
-
-    durations: Array
-    first: Indices
-    time_unit: float
-    spread: Array
-    centre: Array
 
 
 @compiled
@@ -208,7 +195,7 @@ def assemble(durations: Array, given: Flags, values: Array, bubbles: Flags, gram
         gram, cost_order: of `reference_element.GRAMS`, 4 minimises snap, 3 jerk.
 
     Returns:
-        Fields of `ReducedProgram`.
+        The program, as described at `ProgramArrays`.
 
     Raises:
         numpy.linalg.LinAlgError: the cost is not positive definite on what is left free.
@@ -253,7 +240,7 @@ def assemble(durations: Array, given: Flags, values: Array, bubbles: Flags, gram
 
 @compiled
 def coefficients(program: ProgramArrays, w: Array) -> Array:
-    """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]; program: fields of `ReducedProgram`."""
+    """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]; program: of `assemble`."""
     durations, first, unit, spread, centre = program
     m, n = spread.shape
     unknowns = np.empty((3, n))

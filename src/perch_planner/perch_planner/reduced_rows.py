@@ -62,7 +62,7 @@ def normalise(rows: Array, lower: Array, upper: Array) -> None:
 
 @compiled
 def rows_of(program: ProgramArrays, bounds: BoundArrays) -> Rows:
-    """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,); fields of `ReducedProgram` and `Bounds`."""
+    """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,); program: of `reduced_qp.assemble`, bounds: fields of `Bounds`."""
     durations, first, unit, spread, centre = program
     owner, segments, places, orders, direction, lower, upper = bounds
     m, wide = len(spread), spread.T.copy()

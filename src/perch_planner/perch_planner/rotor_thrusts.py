@@ -217,7 +217,7 @@ def _functions(program: ProgramArrays, segment: int, at: Indices) -> Array:
     """Acceleration, jerk and snap at some places of a segment, as factors of w of one dimension and constants of all three.
 
     Args:
-        program: fields of `ReducedProgram`.
+        program: of `reduced_qp.assemble`.
         segment: its number.
         at: numbers of the places, shape (n,).
 
@@ -241,7 +241,7 @@ def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients:
     """Linearised bounds on the rotors that leave [low, high] or are near to it.
 
     Args:
-        program: fields of `ReducedProgram`.
+        program: of `reduced_qp.assemble`.
         thrusts, row: of `sampled`; what lies beyond the limits between the places is made up for at the places.
         coefficients, heading, mass, J, mixing: as for `sampled`.
         low, high: limits of a rotor's thrust [N].

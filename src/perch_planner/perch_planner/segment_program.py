@@ -48,7 +48,7 @@ def _judged(program: ProgramArrays, rows: Rows, keys: Indices, w: Array, dual: A
     """A solution's plan, what it is worth, and the next program.
 
     Args:
-        program: fields of `ReducedProgram`.
+        program: of `reduced_qp.assemble`.
         rows: of the program that was solved; the last ones, one for each of `keys`, hold near its plan alone.
         w, dual: its solution.
         yaw, heading, question, rotors, patient, later: as for `judgement.judge`.
