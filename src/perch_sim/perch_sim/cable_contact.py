@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core import so3
-from perch_core.values import Contact, nanoseconds
+from perch_core.values import Contact
 from perch_sim.attachment import FREE, Attachment
 from perch_sim.contact_event import ContactState
 from perch_sim.dynamics import Hold
@@ -99,7 +99,7 @@ class CableMonitor:
         self._attachment, self.hold = None, FREE
 
     def update(self, time: float, x: np.ndarray) -> list[Contact]:
-        """What changed since the last call, one control period ago.
+        """What changed since the last call, one control period ago; the caller stamps it.
 
         Args:
             time: [s].
@@ -127,7 +127,7 @@ class CableMonitor:
             if not self.crashed and close and line.enters(x[:3], R_WB, self._radii):
                 self.crashed = True
                 events += self._missed(k)
-                events.append(self._event(time, ContactState.COLLISION, k, x, R_WB, near, "crashed: a cable in the rotors"))
+                events.append(self._event(ContactState.COLLISION, k, x, R_WB, near, "crashed: a cable in the rotors"))
         return events
 
     def _missed(self, k: int) -> list[Contact]:
@@ -138,7 +138,7 @@ class CableMonitor:
     def _within_reach(self, time: float, k: int, x: np.ndarray, R_WB: np.ndarray, gripper_W: np.ndarray,
                       near: Nearest) -> list[Contact]:
         """Grip the cable, or remember how near it came."""
-        event = self._event(time, ContactState.BOUNCED, k, x, R_WB, near, "")
+        event = self._event(ContactState.BOUNCED, k, x, R_WB, near, "")
         speed = math.hypot(event.normal_speed, event.tangential_speed)
         refusal = grip_refusal(near.distance, event.tilt_error, speed, self._grip)
         if not refusal and (near.distance < TOUCH or event.normal_speed <= 0.0):
@@ -151,10 +151,10 @@ class CableMonitor:
             self._nearest[k] = event._replace(reason=refusal)
         return []
 
-    def _event(self, time: float, state: ContactState, k: int, x: np.ndarray, R_WB: np.ndarray, near: Nearest,
+    def _event(self, state: ContactState, k: int, x: np.ndarray, R_WB: np.ndarray, near: Nearest,
                reason: str) -> Contact:
         velocity = x[7:10] + R_WB @ np.cross(x[10:13], [0.0, 0.0, -self._offset])
         into = float(-velocity @ R_WB[:, 2])  # the gripper meets the cable along -b3
         across = float(np.linalg.norm(velocity + into * R_WB[:, 2]))
         tilt = abs(float(so3.angle_between(R_WB[:, 2], near.direction)) - math.pi / 2)
-        return Contact(nanoseconds(time), state, f"cable {k}", into, across, tilt, near.distance, reason)
+        return Contact(0, state, f"cable {k}", into, across, tilt, near.distance, reason)

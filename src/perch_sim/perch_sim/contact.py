@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core import so3
-from perch_core.values import Contact, nanoseconds
+from perch_core.values import Contact
 from perch_sim.attachment import FREE, Attachment
 from perch_sim.contact_event import ContactState
 from perch_sim.dynamics import Hold
@@ -90,7 +90,7 @@ class ContactMonitor:
         self._attachment, self.hold = None, FREE
 
     def update(self, time: float, before: np.ndarray, x: np.ndarray, touched: np.ndarray) -> list[Contact]:
-        """What changed at this instant.
+        """What changed at this instant; the caller stamps it.
 
         Args:
             time: [s].
@@ -124,7 +124,7 @@ class ContactMonitor:
         if state is ContactState.ATTACHED:
             self._attach(time, s, x, p_WS)
         offset = float(np.hypot(impact.offset_S[0], impact.offset_S[1])) if s == self._obstacles.pad else 0.0
-        return Contact(nanoseconds(time), state, self._obstacles.names[s], impact.normal_speed, impact.tangential_speed,
+        return Contact(0, state, self._obstacles.names[s], impact.normal_speed, impact.tangential_speed,
                        impact.tilt_error, offset, reason)
 
     def _judge(self, s: int, impact: Impact, rest: bool, speed: float) -> tuple[ContactState, str]:
@@ -153,7 +153,7 @@ class ContactMonitor:
             del self._touched[s]
         if not over or self._touched:
             return []
-        return [Contact(nanoseconds(time), ContactState.NONE, self._obstacles.names[over[0]], 0.0, 0.0, 0.0, 0.0, "")]
+        return [Contact(0, ContactState.NONE, self._obstacles.names[over[0]], 0.0, 0.0, 0.0, 0.0, "")]
 
     def _attach(self, time: float, s: int, x: np.ndarray, p_WS: np.ndarray) -> None:
         """Hold the plate where it touched; it is then drawn flat on the surface."""
