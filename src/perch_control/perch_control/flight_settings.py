@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from perch_core.arrays import Vector3
 from perch_core.config import quantity
-from perch_core.vehicle import Vector3
 
 
 @dataclass(frozen=True)

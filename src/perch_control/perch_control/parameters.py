@@ -8,10 +8,11 @@ from typing import Any
 from perch_control.flight_settings import FlightSettings
 from perch_control.laws import check_law
 from perch_control.nmpc.settings import NmpcSettings
+from perch_core.arrays import Vector3
 from perch_core.config import part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.imu_axes import IMU_AXES
-from perch_core.vehicle import ControlGains, Vector3, load_vehicle
+from perch_core.vehicle import ControlGains, load_vehicle
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,8 @@ Flags = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
 Numbers = Sequence[float] | np.ndarray
 """Floats in order: a tuple, a list, an array with one axis."""
 Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+Vector4 = tuple[float, float, float, float]
+Quaternion = Vector4
 """xyzw."""
 
 

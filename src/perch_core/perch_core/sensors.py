@@ -13,13 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from perch_core import config, so3
+from perch_core.arrays import Quaternion, Vector3
 from perch_core.camera import IMAGE_LEAST, Camera, camera_of
 from perch_core.camera_mount import CameraMount
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError
-
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)

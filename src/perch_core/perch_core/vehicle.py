@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from perch_core import config, so3
+from perch_core.arrays import Quaternion, Vector3, Vector4
 from perch_core.camera import Camera, EquidistantCamera, PinholeCamera
 from perch_core.camera_mount import CameraMount
 from perch_core.config import LARGEST, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.extends import extended_mapping
 
-Vector3 = tuple[float, float, float]
-Vector4 = tuple[float, float, float, float]
 GRAVITY = 9.81  # standard gravity of paper M [m/s^2]
 
 
@@ -31,7 +30,7 @@ class CameraConfig:
     centre: tuple[float, float] = quantity(unit="px", low=0.0, doc="cx, cy")
     distortion: Vector4 = quantity((0.0, 0.0, 0.0, 0.0), low=-10.0, high=10.0, doc="k1..k4 of the Kannala-Brandt polynomial")
     position: Vector3 = quantity(unit="m", low=-5.0, high=5.0, doc="p_BC")
-    orientation: Vector4 = quantity(low=-1.01, high=1.01, doc="q_BC, xyzw")
+    orientation: Quaternion = quantity(low=-1.01, high=1.01, doc="q_BC, xyzw")
     colour: bool = quantity(False, doc="rgb8 instead of mono8")
     rate: float = quantity(30.0, unit="Hz", above=0.0, high=120.0)
     exposure: float = quantity(0.0035, unit="s", above=0.0, high=0.03)

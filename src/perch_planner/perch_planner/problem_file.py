@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from perch_core import config
+from perch_core.arrays import Vector3
 from perch_core.config import part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
 
-Vector3 = tuple[float, float, float]
 _ZERO = (0.0, 0.0, 0.0)
 
 

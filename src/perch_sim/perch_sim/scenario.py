@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from perch_core import config
+from perch_core.arrays import Vector3, Vector4
 from perch_core.catenary import Catenary
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError, PerchError
 from perch_core.surface import PerchSurface
 from perch_sim.scenario_files import scenario_mapping
-
-Vector3 = tuple[float, float, float]
-Vector4 = tuple[float, float, float, float]
 
 NODES = {
     "vehicle": "perch_sim",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from perch_core.arrays import Vector3
 from perch_core.config import part, quantity
 from perch_core.errors import ConfigError
-from perch_core.vehicle import Vector3
 
 
 @dataclass(frozen=True)

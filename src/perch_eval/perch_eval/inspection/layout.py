@@ -7,8 +7,9 @@ import math
 
 import numpy as np
 
+from perch_core.arrays import Vector3
 from perch_core.lines import Segment, scaled_clearance, segment_distance
-from perch_core.vehicle import Vector3, load_vehicle
+from perch_core.vehicle import load_vehicle
 from perch_eval.inspection.measures import collisions, reference_states, segments
 from perch_sim.scenario import Cable, Scenario, Start, Waypoint
 

@@ -11,9 +11,10 @@ from perch_control.geometric import packed_vehicle
 from perch_control.mission.waypoints import waypoint_lines
 from perch_control.nmpc.reference_rows import reference_row
 from perch_control.reference import FlatReference
+from perch_core.arrays import Vector3
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.trajectory import FlatTrajectory
-from perch_core.vehicle import Vector3, Vehicle, load_vehicle
+from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.flight import Flight
 from perch_planner.powerline.visibility import Visibility, visibility
 from perch_sim.contact_event import ContactState

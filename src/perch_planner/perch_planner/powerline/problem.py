@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from perch_core import config
+from perch_core.arrays import Quaternion, Vector3
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.lines import Segment
@@ -20,8 +21,6 @@ from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 
-Vector3 = tuple[float, float, float]
-Vector4 = tuple[float, float, float, float]
 ZERO = (0.0, 0.0, 0.0)
 
 
@@ -48,7 +47,7 @@ class StartConfig:
     """Where the manoeuvre begins, with the rotors carrying the weight."""
 
     position: Vector3 = quantity(unit="m")
-    orientation: Vector4 = quantity((0.0, 0.0, 0.0, 1.0), doc="xyzw; normalised")
+    orientation: Quaternion = quantity((0.0, 0.0, 0.0, 1.0), doc="xyzw; normalised")
     velocity: Vector3 = quantity(ZERO, unit="m/s")
     body_rate: Vector3 = quantity(ZERO, unit="rad/s")
 
@@ -61,7 +60,7 @@ class PerchConfig:
     """The perch: either `position` and `orientation`, or `point` of the target line and `pitch_deg` with free yaw."""
 
     position: Vector3 | None = quantity(None, unit="m", doc="of the centre of mass")
-    orientation: Vector4 | None = quantity(None, doc="xyzw; only b3 counts")
+    orientation: Quaternion | None = quantity(None, doc="xyzw; only b3 counts")
     point: Vector3 | None = quantity(None, unit="m", doc="near the target line")
     pitch_deg: float | None = quantity(None, unit="deg", low=0.0, high=180.0, doc="about the line, from the vertical")
     velocity: Vector3 = quantity(ZERO, unit="m/s")
