@@ -12,13 +12,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from perch_core import so3
+from perch_core.values import NANOSECONDS
 from perch_core.vehicle import load_vehicle
 from perch_sim import seeding
 from perch_sim.body import make_body
 from perch_sim.drawing import Drawing, DrawnInProcesses, DrawnOnDemand
 from perch_sim.plant import resting_state
 from perch_sim.scenario import Wind, load_scenario
-from perch_sim.simulation import SECOND, Simulation
+from perch_sim.simulation import Simulation
 from perch_sim.vio_model import ATTITUDE_NOISE, VioModel, VioModelParameters
 
 SCENARIO = dataclasses.replace(load_scenario("surface_90"), wind=Wind(steady=(0.3, 0.2, 0.0), gust_sigma=0.2))
@@ -38,7 +39,7 @@ def fly(seconds: float, seed: int, render: tuple[str, ...] = (), late: bool = Fa
     """Digest of all states and samples, and all images, looked at as they arrive or in the end from last to first."""
     flown, deliveries, seen = hashlib.sha256(), [], {}
     flight = Simulation(SCENARIO, seed, DrawnOnDemand(SCENARIO, seed, render))
-    while flight.time < (1 + seconds) * SECOND:
+    while flight.time < (1 + seconds) * NANOSECONDS:
         flight.motors.command(flight.time, True, climb(flight))
         output = flight.advance()
         for part in (*output.imu, *output.state[1:]):
@@ -70,7 +71,7 @@ def test_images_do_not_depend_on_when_they_are_looked_at_nor_the_flight_on_image
 
 def test_images_arrive_at_thirty_hertz_after_their_exposure():
     flight, frames = Simulation(SCENARIO, 1), []
-    while flight.time < 3 * SECOND:
+    while flight.time < 3 * NANOSECONDS:
         flight.advance()
         delivery = flight.cameras["front"].due(flight.time)
         if delivery is not None:
@@ -183,7 +184,7 @@ def test_a_slow_machine_gives_up_images_in_real_time_and_none_in_lockstep(limit,
     flight = Simulation(load_scenario("surface_90"), seed=1, drawing=Stuck())
     camera = flight.cameras["front"]
     camera.most_waiting = limit
-    while flight.time < SECOND + 5 * SECOND // 30:  # five exposures
+    while flight.time < NANOSECONDS + 5 * NANOSECONDS // 30:  # five exposures
         flight.advance()
     assert camera.dropped == given_up
 

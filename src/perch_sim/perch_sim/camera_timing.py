@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core.camera_mount import CameraMount
+from perch_core.values import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 TRIGGER_JITTER = 50_000  # of the exposure's start, one sigma [ns]
 
 

@@ -4,7 +4,7 @@ The same scenario, seed and commands give the same flight, bit by bit. The vehic
 real time; tests and studies can drive it with any controller in a loop:
 
     flight = Simulation(load_scenario("surface_90"), seed=1)
-    while flight.time < 5 * SECOND:
+    while flight.time < 5 * NANOSECONDS:
         flight.motors.command(flight.time, True, controller(flight.state))
         output = flight.advance()
 """
@@ -19,7 +19,7 @@ import numpy as np
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.timing import CONTROL_PERIOD_NS
-from perch_core.values import Contact
+from perch_core.values import NANOSECONDS, Contact
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_sim import seeding
 from perch_sim.calibration import true_imu, true_mounts
@@ -36,7 +36,6 @@ from perch_sim.rendering.sensor import control_exposure
 from perch_sim.scenario import Scenario
 from perch_sim.state_history import StateHistory, TrueState
 
-SECOND = 1_000_000_000
 MEMORY = 60_000_000     # how far back an exposure may reach [ns]
 MOTOR_TIMEOUT = 100_000_000  # a motor controller stops without commands for so long [ns]
 
@@ -65,9 +64,9 @@ class Simulation:
         """
         self.scenario = scenario
         self.vehicle: Vehicle = load_vehicle(scenario.vehicle)
-        if round(SECOND / self.vehicle.imu.rate) != CONTROL_PERIOD_NS:
+        if round(NANOSECONDS / self.vehicle.imu.rate) != CONTROL_PERIOD_NS:
             raise ConfigError(f"vehicles/{scenario.vehicle}", "imu.rate",
-                              f"{self.vehicle.imu.rate:g} is not the control rate of {SECOND / CONTROL_PERIOD_NS:g} Hz")
+                              f"{self.vehicle.imu.rate:g} is not the control rate of {NANOSECONDS / CONTROL_PERIOD_NS:g} Hz")
         self.plant = Plant(scenario, self.vehicle, seed, START)
         self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, MOTOR_TIMEOUT), 0
         self.loop = inner_loop(self.vehicle, scenario.disturbance.loop_lag_factor, scenario.disturbance.voltage_factor)
