@@ -18,13 +18,13 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory
 from perch_core.values import PerchPlan, PerchPlanRequest, limits, seconds
+from perch_core.values.planning import OPTIONS
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_planner import planner, refusals
 from perch_planner.problem import PerchParameters, PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.refusals import PerchRefusal
 from perch_planner.way_out import plan_way_out
 
-OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
 CONTACT_TIME = 0.3  # how long a contact is awaited after the end of a plan, where the mission says nothing [s]
 OBJECTIVES = {4: "snap", 3: "jerk"}
 Method = Callable[[PerchProblem, PerchSettings, Vehicle], planner.PerchPlan]

@@ -9,6 +9,9 @@ import numpy as np
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values.perching import MappedPowerline
 
+OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
+"""Fields of `PerchPlanRequest` that are None where they are left to the planner."""
+
 
 def _zero() -> np.ndarray:
     return np.zeros(3)

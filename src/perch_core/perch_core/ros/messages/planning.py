@@ -10,10 +10,9 @@ from perch_core.ros.messages.basic import floats, quaternion_floats, stamp_value
 from perch_core.ros.messages.flight import trajectory_message, trajectory_value
 from perch_core.ros.messages.perching import powerline_message, powerline_value
 from perch_core.values import Certificate, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest
+from perch_core.values.planning import OPTIONS
 from perch_msgs.msg import Certificate as CertificateMessage
 from perch_msgs.srv import PlanPerch, PlanPowerline
-
-OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
 
 
 def _array(v: Vector3 | Point) -> np.ndarray:
