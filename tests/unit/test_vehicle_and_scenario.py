@@ -8,9 +8,9 @@ import pytest
 from oracles.rigid_body import accelerations
 from perch_core import config
 from perch_core.errors import ConfigError
+from perch_core.extends import extended_mapping
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_sim.scenario import Scenario, load_scenario
-from perch_sim.scenario_files import scenario_mapping
 
 
 def test_snapdragon_has_the_papers_thrust_range():
@@ -120,7 +120,7 @@ def test_a_scenario_takes_over_what_it_does_not_say_itself(tmp_path):
     assert len(mine.world.cables) == 1 and mine.world.room == base.world.room  # lists are replaced, mappings merged
     assert mine.parameters["powerline_planner"] == {**base.parameters["powerline_planner"], "deadline": 12.0}
     assert mine.parameters["controller"] == base.parameters["controller"]
-    assert "extends" not in scenario_mapping(tmp_path / "theirs.yaml")
+    assert "extends" not in extended_mapping("scenarios", tmp_path / "theirs.yaml")
 
 
 @pytest.mark.parametrize("start, words", [

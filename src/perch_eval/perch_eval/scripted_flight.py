@@ -21,6 +21,7 @@ from perch_control.modes import Command, State
 from perch_core import config, so3
 from perch_core.component import Component, Input, Output, Wake
 from perch_core.errors import PerchError
+from perch_core.extends import extended_mapping
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.values import (
     AtEnd, ControllerCommand, ControllerStatus, ControlReference, EstimatorHealth, ImuSample, OdometryState, PerchPlanRequest, TrajectoryOrder,
@@ -28,7 +29,6 @@ from perch_core.values import (
 from perch_eval.in_process import arrange
 from perch_eval.in_process.parameters import NodeParameters
 from perch_sim.scenario import Scenario
-from perch_sim.scenario_files import scenario_mapping
 
 LEAD = 0.04           # from an order to its start [s]
 TAKE_OFF_SPEED = 0.8  # mean [m/s]
@@ -39,7 +39,7 @@ EVERY_STEP = {"controller.reference_period": 0.002}
 
 def scenario_of(name: str, changes: Mapping[str, Any], controller: Mapping[str, Any]) -> Scenario:
     """A scenario with changes, and parameters of the controller in the place of its own."""
-    mapping = {**scenario_mapping(name), "parameters": {"controller": {**EVERY_STEP, **controller}}, **changes}
+    mapping = {**extended_mapping("scenarios", name), "parameters": {"controller": {**EVERY_STEP, **controller}}, **changes}
     return config.from_mapping(Scenario, mapping, name)
 
 

@@ -14,8 +14,8 @@ from perch_core.arrays import Vector3, Vector4
 from perch_core.catenary import Catenary
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError, PerchError
+from perch_core.extends import extended_mapping
 from perch_core.surface import PerchSurface
-from perch_sim.scenario_files import scenario_mapping
 
 NODES = {
     "vehicle": "perch_sim",
@@ -266,4 +266,4 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     Raises:
         ConfigError: no such scenario, or a value that is refused.
     """
-    return config.from_mapping(Scenario, scenario_mapping(name_or_path), str(config.find("scenarios", name_or_path)))
+    return config.from_mapping(Scenario, extended_mapping("scenarios", name_or_path), str(config.find("scenarios", name_or_path)))

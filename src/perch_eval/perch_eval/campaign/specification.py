@@ -21,13 +21,13 @@ import numpy as np
 from perch_core import config
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError
+from perch_core.extends import extended_mapping
 from perch_core.vehicle import Vehicle
 from perch_eval.campaign.distributions import LARGEST_SEED, Distribution, parse, parse_seed
 from perch_eval.flyable import check_flight, check_names
 from perch_eval.in_process import Sensing
 from perch_eval.in_process.parameters import check_parameters
 from perch_sim.scenario import Scenario
-from perch_sim.scenario_files import scenario_mapping
 
 
 RUNS_MAX = 20_000
@@ -112,7 +112,7 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
     """
     file = config.find("campaigns", path)
     content = config.load(_File, file)
-    base = scenario_mapping(content.scenario)
+    base = extended_mapping("scenarios", content.scenario)
     vary = {name: (parse_seed if name == "seed" else parse)(str(file), f"vary.{name}", entry) for name, entry in (content.vary or {}).items()}
     mappable = [name for name in vary if name != "seed"]  # one run a seed: no rate
     for axis in content.map:

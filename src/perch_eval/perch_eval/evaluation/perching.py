@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from perch_core.extends import extended_mapping
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.campaign.causes import SUCCESS
@@ -23,7 +24,6 @@ from perch_eval.flight_view import FlightView
 from perch_eval.in_process import Sensing, fly
 from perch_eval.statistics import Rate, Spread
 from perch_sim.scenario import load_scenario
-from perch_sim.scenario_files import scenario_mapping
 
 CONDITIONS = {"surface_60": (60, 1.7), "surface_90": (90, 1.7), "surface_60_far": (60, 3.0), "surface_90_far": (90, 3.0)}
 """Scenario -> inclination [deg] and distance [m]."""
@@ -51,7 +51,7 @@ def perches(effort: Effort) -> dict[str, list[RunResult]]:
     """The flights of each condition; finished ones of the same code are not flown again."""
     tasks = []
     for number, (name, seed) in enumerate((name, seed) for seed in effort.seeds for name in (*CONDITIONS, AGGRESSIVE)):
-        mapping = scenario_mapping(name)
+        mapping = extended_mapping("scenarios", name)
         tasks.append(Task(Run(number, seed, {"scenario": name}), mapping, "in_process", SENSING))
     found = flown(effort, "flights", tasks)
     return {name: [r for r in found if r.values["scenario"] == name] for name in (*CONDITIONS, AGGRESSIVE)}
@@ -139,7 +139,7 @@ def _engines() -> Section:
     out = Section("engines", "The engine flies what the nodes fly",
                   "surface_90, seed 1, cameras rendered: once on the real ROS 2 nodes (composed, in lockstep), once on the in-process engine "
                   "that flies the tables above.")
-    mapping = {**scenario_mapping("surface_90"),
+    mapping = {**extended_mapping("scenarios", "surface_90"),
                "nodes": ["vehicle", "vio", "estimator", "target_localizer", "perching_planner", "controller", "mission"]}
     with tempfile.TemporaryDirectory(prefix="perch-evaluate-") as folder:
         file = Path(folder) / "surface_90.yaml"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from perch_core import so3
+from perch_core.extends import extended_mapping
 from perch_core.lines import Segment
 from perch_core.trajectory import SampledTrajectory
 from perch_core.values import TrajectoryOrder, seconds
@@ -23,7 +24,6 @@ from perch_eval.in_process import Sensing
 from perch_eval.metrics import touch_of
 from perch_sim.cable_contact import CableLine
 from perch_sim.scenario import Scenario
-from perch_sim.scenario_files import scenario_mapping
 
 ENGINE = "perch_eval.evaluation.powerline_flights:fly_line"
 RENDERED = Sensing(vio="rendered", target="rendered")
@@ -134,7 +134,7 @@ def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], li
     """Flights of each case by (case, whether the gripper works); finished ones of the same code are not flown again."""
     tasks = []
     for number, (seed, case, grips) in enumerate(_flown(effort.seeds_on_lines, cases)):
-        mapping: dict[str, Any] = scenario_mapping(case)
+        mapping: dict[str, Any] = extended_mapping("scenarios", case)
         if not grips:
             mapping["grip"] = mapping.get("grip", {}) | {"enabled": False}
         tasks.append(Task(Run(number, seed, {"scenario": case, "grips": grips}), mapping, ENGINE, RENDERED))
