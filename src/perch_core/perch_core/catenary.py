@@ -113,7 +113,8 @@ class Catenary:
         a, x0 = self.parameter, self._x0
         # cosh(p) - cosh(q) as a product: a is often a thousand times the sag
         z = 2 * a * np.sinh((x - 2 * x0) / (2 * a)) * np.sinh(x / (2 * a))
-        return self.start + x[..., None] * (self._across / self._span) + z[..., None] * np.array([0.0, 0.0, 1.0])
+        points: Array = self.start + x[..., None] * (self._across / self._span) + z[..., None] * np.array([0.0, 0.0, 1.0])
+        return points
 
     def _x_of(self, s: Array) -> Array:
         a, x0 = self.parameter, self._x0
