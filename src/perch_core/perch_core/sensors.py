@@ -57,7 +57,7 @@ class CameraSensor:
     sigma: CalibrationSigmas = part(CalibrationSigmas)
 
     def __post_init__(self) -> None:
-        _check_quaternion("orientation", self.orientation)
+        check_quaternion("orientation", self.orientation)
         if self.model == "pinhole" and any(self.distortion):
             raise ConfigError("", "distortion", f"{list(self.distortion)} of a pinhole: the model with distortion is radtan")
         self.camera  # noqa: B018 (raises where it is none)
@@ -100,7 +100,7 @@ class ImuSensor:
     topic: str = text("", doc="of its samples in recordings; empty: imu/data_raw")
 
     def __post_init__(self) -> None:
-        _check_quaternion("orientation", self.orientation)
+        check_quaternion("orientation", self.orientation)
 
     @property
     def accel_noise(self) -> float:
@@ -145,6 +145,11 @@ def _rotation(q: Quaternion) -> np.ndarray:
     return so3.quat_to_matrix(np.array(q) / np.linalg.norm(q))
 
 
-def _check_quaternion(key: str, q: Quaternion) -> None:
+def check_quaternion(key: str, q: Quaternion) -> None:
+    """Refuse a quaternion whose norm is not 1.
+
+    Raises:
+        ConfigError: it is not; with the key.
+    """
     if not abs(np.linalg.norm(q) - 1.0) < 1e-3:
         raise ConfigError("", key, f"norm {np.linalg.norm(q):.4f} is not 1")

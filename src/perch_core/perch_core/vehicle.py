@@ -15,6 +15,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.config import LARGEST, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.extends import extended_mapping
+from perch_core.sensors import check_quaternion
 
 GRAVITY = 9.81  # standard gravity of paper M [m/s^2]
 
@@ -41,8 +42,7 @@ class CameraConfig:
     stamp_offset: float = quantity(0.0, unit="s", low=-0.05, high=0.05, doc="stamp minus true mid-exposure time")
 
     def __post_init__(self) -> None:
-        if abs(np.linalg.norm(self.orientation) - 1) > 1e-3:
-            raise ConfigError("", "orientation", f"norm {np.linalg.norm(self.orientation):.4f} is not 1")
+        check_quaternion("orientation", self.orientation)
         if self.model == "pinhole" and any(self.distortion):
             raise ConfigError("", "distortion", f"{list(self.distortion)} is of the model equidistant: a pinhole has none")
         if self.transport_max < self.transport_min:
