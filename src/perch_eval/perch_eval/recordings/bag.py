@@ -52,7 +52,7 @@ class BagRecording(Recording):
         pictures = {topic for topic, kind in kinds.items() if kind in IMAGES}
         imus = sorted(topic for topic, kind in kinds.items() if kind == IMU_TYPE)
         if sensors is None:
-            self._cameras = {_camera_of(topic, sorted(pictures)): topic for topic in sorted(pictures)}
+            self._cameras = {_camera_of(topic): topic for topic in sorted(pictures)}
             self._imu = imus[0] if imus else ""
         else:
             found = {name: _topic(camera.topic or f"camera_{name}/image_raw", pictures) for name, camera in sensors.cameras.items()}
@@ -161,7 +161,7 @@ def _topic(wanted: str, there: set[str]) -> str:
     return (exact or [topic for topic in sorted(there) if topic.endswith(names)] or [""])[0]
 
 
-def _camera_of(topic: str, others: list[str]) -> str:
-    """A name for the camera of a topic: `down` of camera_down/image_raw; else what tells it from the others."""
+def _camera_of(topic: str) -> str:
+    """A name for the camera of a topic: `down` of camera_down/image_raw; else its whole name."""
     first = topic.strip("/").removesuffix("/compressed").removesuffix("/image_raw")
     return first.rpartition("camera_")[2].replace("/", "_") or "camera"
