@@ -124,17 +124,16 @@ def dive():
 def turned(trajectory, yaw):
     """A trajectory turned about the vertical."""
     Z = Rotation.from_euler("z", yaw)
-    q = np.array([so3.quat_multiply(Z.as_quat(), q) for q in trajectory.q])
-    return replace(trajectory, p=Z.apply(trajectory.p), v=Z.apply(trajectory.v), a=Z.apply(trajectory.a), q=q)
+    return replace(trajectory, p=Z.apply(trajectory.p), v=Z.apply(trajectory.v), a=Z.apply(trajectory.a), q=so3.quat_multiply(Z.as_quat(), trajectory.q))
 
 
 @pytest.mark.parametrize("yaw", [2.2, np.pi - 0.05, np.pi, np.pi + 0.02])
 def test_the_first_command_does_not_depend_on_the_heading(dive, yaw):
     """Where quaternions of neighbouring nodes change their sign, too."""
-    law, k = predictive(vehicle=RPG), RPG.thrust_coefficient
+    law, k, paths = predictive(vehicle=RPG), RPG.thrust_coefficient, (dive, turned(dive, yaw))
     for t in np.arange(dive.duration - 2.0, dive.duration - 0.6, 0.05):
         found = []
-        for path in (dive, turned(dive, yaw)):
+        for path in paths:
             law.begin()
             x = path.sample(float(t))
             speeds = tuple(np.sqrt(np.clip(x.rotor_thrust, RPG.thrust_min, None) / k))
@@ -156,13 +155,12 @@ def test_a_blend_is_no_tilt(dive):
     assert least < 0.0  # along the acceleration it would be half a turn
 
 
-def test_a_reference_keeps_the_attitude_that_it_carries():
+def test_a_reference_keeps_the_attitude_that_it_carries(dive):
     """On the way from one reference to another an acceleration is added; near free fall that must not turn the vehicle."""
-    trajectory = problem.plan(problem.load("powerline_line_180")).plan.trajectory(RotorModel.of(RPG))
-    source, vehicle = SampledReference(trajectory, RPG.mass), packed_vehicle(RPG)
-    for t in np.linspace(0.0, trajectory.duration, 25):
+    source, vehicle = SampledReference(dive, RPG.mass), packed_vehicle(RPG)
+    for t in np.linspace(0.0, dive.duration, 25):
         x = source.setpoint(float(t))
-        there = trajectory.sample(float(t))
+        there = dive.sample(float(t))
         for push in (0.0, 0.5):
             row = np.array(reference_row(x._replace(a=tuple(np.add(x.a, (push, 0.0, -push)))).packed, 0.5, vehicle))
             assert abs(row[3:7] @ there.q) > np.cos(np.radians(0.05)) and np.abs(row[10:13] - there.w).max() < 0.01
