@@ -78,6 +78,7 @@ class Show:
         self.handlers = {port.channel(self.viewer): port.handler(self.viewer) for port in ports(type(self.viewer), Input)}
         self.drawn = []
         self.viewer.markers.receivers.append(self.drawn.append)
+        self.shown, self.seen = {}, 0  # of the markers, the newest; of the messages with markers, how many are among them
         self.client = Client(self.loop, self.viewer.server.port, origin)
         self.step = 500
 
@@ -100,11 +101,12 @@ class Show:
             self.loop.run_until_complete(asyncio.sleep(0.002))
 
     def markers(self):
-        shown = {}
-        for _, data in self.client.of("/markers"):
+        messages = self.client.of("/markers")
+        for _, data in messages[self.seen:]:
             for item in topics.decode(MARKERS, data).markers:
-                shown.setdefault(item.ns, {})[item.id] = item
-        return shown
+                self.shown.setdefault(item.ns, {})[item.id] = item
+        self.seen = len(messages)
+        return self.shown
 
     def close(self):
         self.viewer.close()
