@@ -121,6 +121,15 @@ def show():
     found.close()
 
 
+@pytest.fixture(scope="module")
+def served():
+    """For tests of who may connect: its end takes half a second."""
+    found = Show()
+    found.odometry()
+    yield found
+    found.close()
+
+
 def test_a_client_sees_topics_with_their_definitions_scene_and_time(show):
     client = show.client
     show.odometry()
@@ -218,25 +227,25 @@ def test_what_cannot_be_drawn_is_warned_of_and_passed_on(show):
     show.until(lambda: "/trajectory" in show.client.channels, "the topic")
 
 
-def test_a_port_in_use_is_refused_with_what_to_do(show):
-    port = show.viewer.server.port
+def test_a_port_in_use_is_refused_with_what_to_do(served):
+    port = served.viewer.server.port
     with pytest.raises(ConfigError, match=f"viewer: port: 127.0.0.1:{port} cannot be served .*choose another"):
         Viewer(ViewerParameters(port=port))
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "https://evil.example:8765", "null", "https://app.foxglove.dev.evil.example",
                                     "http://localhost.evil.example", "http://app.foxglove.dev", "nonsense"])
-def test_pages_of_elsewhere_are_refused(show, origin):
+def test_pages_of_elsewhere_are_refused(served, origin):
     with pytest.raises(HTTPClientError, match="403"):
-        Client(show.loop, show.viewer.server.port, origin)
+        Client(served.loop, served.viewer.server.port, origin)
 
 
 @pytest.mark.parametrize("origin", [None, "https://app.foxglove.dev", "http://localhost:8080", "http://127.0.0.1:3000", "http://[::1]:8080", "file://"])
-def test_foxglove_local_pages_and_programs_are_let_in(origin):
-    show = Show(origin=origin)
-    show.odometry()
-    show.until(lambda: "/odometry" in show.client.channels, "the topics")
-    show.close()
+def test_foxglove_local_pages_and_programs_are_let_in(served, origin):
+    client = Client(served.loop, served.viewer.server.port, origin)
+    served.until(lambda: "/odometry" in client.channels, "the topics")
+    client.socket.close()
+    served.until(lambda: client.closed, "the end of the connection")
 
 
 def test_origins_are_a_parameter():
@@ -247,22 +256,22 @@ def test_origins_are_a_parameter():
     show.close()
 
 
-def test_the_server_behind_the_gate_listens_on_the_loopback_alone(show):
-    host, port = show.viewer.server._gate._behind
-    assert host.startswith("127.") and host != "127.0.0.1" and port != show.viewer.server.port
+def test_the_server_behind_the_gate_listens_on_the_loopback_alone(served):
+    host, port = served.viewer.server._gate._behind
+    assert host.startswith("127.") and host != "127.0.0.1" and port != served.viewer.server.port
 
 
-def test_no_handshake_ends_a_connection_and_nothing_else(show):
+def test_no_handshake_ends_a_connection_and_nothing_else(served):
     async def knock():
-        reader, writer = await asyncio.open_connection("127.0.0.1", show.viewer.server.port)
+        reader, writer = await asyncio.open_connection("127.0.0.1", served.viewer.server.port)
         writer.write(b"x" * 100_000)
         try:
             return await reader.read()
         except ConnectionResetError:
             return b""
 
-    assert show.loop.run_until_complete(asyncio.wait_for(knock(), 120.0)) == b""
-    Client(show.loop, show.viewer.server.port)
+    assert served.loop.run_until_complete(asyncio.wait_for(knock(), 120.0)) == b"" and not served.client.closed
+    Client(served.loop, served.viewer.server.port)
 
 
 def test_the_layout_shows_what_is_served():
