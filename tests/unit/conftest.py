@@ -25,4 +25,4 @@ def reported(recorded, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("reported")
     shutil.copy(recorded[0], folder)
-    return folder, build_report(folder, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
+    return folder, build_report(folder, load_scenario("surface_90"), 3, "perched", "held <by velcro>", 2.0, 4.0)

@@ -123,12 +123,13 @@ def test_diagnostics_are_words_with_units(key, words):
     assert report._with_unit(key, 12.5) == words
 
 
-def test_an_animation_has_a_frame_for_each_moment(recorded, tmp_path):
+def test_an_animation_has_a_frame_for_each_moment_and_plots_are_written(recorded, tmp_path):
     path, _ = recorded
     gif = tmp_path / "f.gif"
-    assert main([str(path), "--from", "1.2", "--to", "1.6", "--fps", "10", "--out", str(gif)]) == 0
+    assert main([str(path), "--from", "1.2", "--to", "1.6", "--fps", "10", "--out", str(gif), "--plots", str(tmp_path / "plots")]) == 0
     with Image.open(gif) as image:
         assert image.n_frames == 4
+    assert {"tracking.png", "path.png", "rates.png", "thrust.png"} <= {p.name for p in (tmp_path / "plots").iterdir()}
 
 
 def test_a_stroboscopic_picture_shows_each_instant_of_the_perch(recorded, tmp_path):
@@ -152,13 +153,6 @@ def test_mp4_needs_no_other_program(recorded, tmp_path, monkeypatch):
     assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (4, 10)
     found, frame = video.read()
     assert found and np.ptp(frame) > 100  # something is drawn
-
-
-def test_plots_are_written(recorded, tmp_path):
-    path, _ = recorded
-    assert main([str(path), "--from", "1.2", "--to", "1.4", "--fps", "10", "--out", str(tmp_path / "f.gif"),
-                 "--plots", str(tmp_path / "plots")]) == 0
-    assert {"tracking.png", "path.png", "rates.png", "thrust.png"} <= {p.name for p in (tmp_path / "plots").iterdir()}
 
 
 def test_the_vehicle_is_that_of_the_recording_or_of_its_report(reported, tmp_path, monkeypatch, capsys):
