@@ -77,7 +77,7 @@ class Flown:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("begin, rate", [(0.0, 100.0), (0.0, 400.0), (0.0, 1000.0), (1.9, 100.0), (1.9, 1000.0)])
+@pytest.mark.parametrize("begin, rate", [(0.0, 100.0), (0.0, 1000.0), (1.9, 100.0), (1.9, 1000.0)])
 def test_large_biases_are_found(begin, rate):
     """From rest, and switched on in motion."""
     flown = Flown(rate, begin)
