@@ -95,13 +95,11 @@ def test_weak_rotors_do_not_begin_a_perch(share, flies):
         assert flies
 
 
-@pytest.mark.parametrize("name, repeated", [("abort", False), ("jumping odometry", True)])
-def test_a_fault_flight_has_a_good_end_and_is_repeatable(name, repeated):
-    """The one whose size is drawn, too, is flown again: the same seed is the same flight."""
-    fault = next(f for f in FAULTS if f.name == name)
-    first = fly_fault(fault, 4)
-    assert first.done and first.end in END_STATES, first
-    assert not repeated or fly_fault(fault, 4) == first
+@pytest.mark.parametrize("name", ["abort", "jumping odometry"])
+def test_a_fault_flight_has_a_good_end(name):
+    """That the same seed is the same flight is shown in `test_control_weak_rotors.py`, where one is short."""
+    ending = fly_fault(next(f for f in FAULTS if f.name == name), 4)
+    assert ending.done and ending.end in END_STATES, ending
 
 
 def test_the_end_is_judged_by_the_truth():
