@@ -79,10 +79,16 @@ class Flight:
         return np.linalg.norm(state.p_WB - truth.p_WB[0]), np.linalg.norm(state.v_WB - truth.v_WB[0]), np.linalg.norm(turn)
 
 
+@functools.cache
+def climbed(lens="equidistant", rate=500.0):
+    """After the whole flight."""
+    return Flight(lens, rate).fly()
+
+
 @pytest.mark.parametrize(("lens", "rate"), [("equidistant", 500.0), ("equidistant", 100.0), ("equidistant", 1000.0),
                                             ("plumb_bob", 500.0), ("rational_polynomial", 200.0)])
 def test_a_climb_with_every_lens_and_imu_rate(lens, rate):
-    flight = Flight(lens, rate).fly()
+    flight = climbed(lens, rate)
     states = flight.out["state"]
     assert len(states) > 100 and isinstance(states[-1], InertialState)
     p, v, turn = flight.error(states[-1])
@@ -96,8 +102,7 @@ def test_a_climb_with_every_lens_and_imu_rate(lens, rate):
 
 def test_the_wrong_lens_is_not_the_same():
     """The intrinsics are those of camera_info: told another lens, VIO is wrong."""
-    right, wrong = Flight().fly(3.0), Flight(told="plumb_bob").fly(3.0)
-    off = [max(flight.error(s)[0] for s in flight.out["state"]) for flight in (right, wrong)]
+    off = [max(flight.error(s)[0] for s in flight.out["state"] if s.stamp < 3e9) for flight in (climbed(), Flight(told="plumb_bob").fly(3.0))]
     assert off[1] > 0.05 > 2 * off[0]
 
 
