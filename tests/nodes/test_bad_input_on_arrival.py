@@ -8,17 +8,16 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from fuzzing.spoiled import kinds, plain_ways, spoilt
 from nav_msgs.msg import Odometry
 from nodes.good import messages, requests
 from nodes.node_process import PATIENCE, Running, plain, watching
-from nodes.spoiled import kinds, plain_ways, spoilt
 from perch_core.ros import topics
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 PERIOD = 10_000_000  # of the good samples [ns]
 AGAIN = 0.2          # [s] a line of one kind is said once a second: what shall lead to one is sent this often until it does
-EXAMINED = ("estimator", "vio", "target_localizer", "controller", "mission", "description")
 STAMPS = ("header.stamp is past", "header.stamp is negative", "header.stamp is future")
 POSE = ("pose.pose.position.x is nan", "pose.pose.position.y is inf", "pose.pose.orientation is zero", "pose.pose.orientation.x is 1e+300")
 CAMERA = ("distortion_model is nonsense", "d is huge", "d.0 is nan", "k.0 is nan", "k.0 is 1e+300", "width is its largest")

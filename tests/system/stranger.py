@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rclpy
 from nodes.good import messages
-from nodes.spoiled import plain_ways, spoilt
+from fuzzing.spoiled import plain_ways, spoilt
 from perch_core.ros import topics
 from perch_core.ros.node import StopSignal
 from rclpy.executors import SingleThreadedExecutor

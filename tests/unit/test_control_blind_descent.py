@@ -33,7 +33,12 @@ def test_a_thrust_that_is_not_the_files_is_not_taken_for_the_ground(disturbances
 def test_vibration_is_not_taken_for_the_ground():
     flight, rng = hovering(), np.random.default_rng(0)
     felt = flight.imu
-    flight.imu = lambda: felt()._replace(f_B=tuple(np.add(felt().f_B, 3.0 * rng.standard_normal(3))))
+
+    def shaken():
+        sample = felt()
+        return sample._replace(w_B=tuple(np.add(sample.w_B, 0.01 * rng.standard_normal(3))), f_B=tuple(np.add(sample.f_B, 3.0 * rng.standard_normal(3))))
+
+    flight.imu = shaken
     lands(flight, odometry=False)
 
 

@@ -156,22 +156,6 @@ def test_jumped_odometry_hovers_at_the_new_place_without_chasing_it():
     assert np.linalg.norm(loop.plant.v) < 0.05 and abs(loop.plant.p[0] - p[0]) < 1.0
 
 
-def test_missing_odometry_descends_on_the_imu_alone():
-    loop = make_loop()
-    loop.begin_in_hover()
-    rng = np.random.default_rng(0)
-
-    def noisy(now, sample):
-        w, f = np.array(sample.w_B) + 0.01 * rng.normal(size=3), np.array(sample.f_B) + 0.316 * rng.normal(size=3)
-        return sample._replace(w_B=tuple(w.tolist()), f_B=tuple(f.tolist()))
-
-    loop.flight.filters["controller", "imu/data_raw"] = noisy
-    loop.flight.filters["controller", "odometry"] = lambda now, state: None
-    loop.run(6.0)
-    assert loop.controller.state is State.DISARMED
-    assert loop.plant.p[2] < 0.02 and loop.plant.impact_speed < 2.0
-
-
 def test_estimation_errors_do_not_shake_the_hover():
     loop = make_loop(noise_seed=3)
     loop.begin_in_hover()

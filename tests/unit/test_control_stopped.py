@@ -222,17 +222,6 @@ def test_what_waits_through_a_silence_at_rest_is_not_begun_in_its_middle(command
     assert flight.state is state and flight.plant.p[2] < 0.01
 
 
-def test_an_abort_that_waits_for_its_way_out_is_not_undone_by_the_next_plan():
-    loop, start = leaving()
-    ready(loop, start, start + 0.6)
-    loop.run(0.3)
-    loop.controller.abort("stop it")
-    with pytest.raises(TrajectoryRefused, match="about to be left"):
-        loop.controller.follow(continuation(loop, start))
-    loop.run(0.4)
-    assert loop.controller.state is State.RECOVERING
-
-
 def test_a_recovery_that_begins_elsewhere_does_not_take_the_place_of_the_appended_one():
     loop, start = leaving(recovery_start=0.8)
     path = along_x(start + 0.8, 0.32 + 0.5, 0.4, 0.6, brakes=True)

@@ -13,7 +13,6 @@ from unit.component_outputs import Outputs
 
 MS = 1_000_000
 LEVEL = (0.0, 0.0, 0.0, 1.0)
-NO_TWIST = np.diag([-1.0, 0, 0, 0, 0, 0])
 
 
 def odometry(stamp, p=(0.0, 0.0, 1.0), q=LEVEL, sigma=0.01, frame="odom", **changes):

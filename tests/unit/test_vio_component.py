@@ -142,8 +142,8 @@ def test_colour_images_are_used_in_grey():
     def tamper(image):
         return CameraImage(image.stamp, FRAME, 640, 480, "bgr8", np.repeat(image.pixels()[..., None], 3, axis=2))
 
-    grey, colour = Flight().fly(1.5), Flight().fly(1.5, tamper=tamper)
-    assert [s.p_WB.tolist() for s in grey.out["state"]] == [s.p_WB.tolist() for s in colour.out["state"]]
+    grey, colour = ([s.p_WB.tolist() for s in flight.out["state"]] for flight in (climbed(), Flight().fly(1.5, tamper=tamper)))
+    assert len(colour) > 25 and grey[:len(colour)] == colour
 
 
 @pytest.mark.parametrize("shift", [-3600 * 10**9, 3600 * 10**9])
