@@ -16,6 +16,7 @@ from perch_core.vehicle import Vehicle
 _EARLIEST = 60.0        # a trajectory is not kept for longer before its start [s]
 LATEST = 0.5            # the oldest start that is flown: a plan is of the present [s]
 START_GAP = 0.35        # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
+CONTACT_EARLY = 0.15    # a contact may come so long before the plan has it [s]
 _START_SPEED_GAP = 1.0  # the same for the velocity [m/s]
 _STEP = 0.02            # largest step inside a trajectory [m]; ten times this for the velocity [m/s]
 

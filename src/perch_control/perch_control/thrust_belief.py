@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import hypot
 
+from perch_control.admission import CONTACT_EARLY
 from perch_control.flight_state import FlightState
 from perch_control.l1 import L1Augmentation
 from perch_control.law import Law
@@ -11,8 +12,6 @@ from perch_control.rotor_health import RATE_MOST, RotorHealth
 from perch_control.rotor_lag import thrusts
 from perch_core.vector3 import axes_of, scale
 from perch_core.vehicle import Vehicle
-
-_TOUCHING = 0.1   # from so long before a planned contact on, a surface or a wire may act on the vehicle [s]
 
 
 class ThrustBelief:
@@ -34,7 +33,7 @@ class ThrustBelief:
 
     def judged(self, x: FlightState, law: Law, compensator: L1Augmentation | None, fresh: bool) -> FlightState:
         """Compare felt and promised thrust in free air, `fresh`: `felt` is of the present; weak rotors are a weaker vehicle from now on."""
-        if not fresh or x.at_ground or x.may_touch(_TOUCHING) or hypot(*x.belief[10:13]) > RATE_MOST:
+        if not fresh or x.at_ground or x.may_touch(CONTACT_EARLY) or hypot(*x.belief[10:13]) > RATE_MOST:
             self.health.pause(x.now)
         elif self.health.update(self.felt, self._promised(x), x.now):
             if not x.weak:

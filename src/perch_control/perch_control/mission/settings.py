@@ -10,6 +10,7 @@ import numpy as np
 
 from perch_core.config import quantity
 from perch_core.errors import ConfigError
+from perch_control.admission import CONTACT_EARLY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,7 @@ class MissionSettings:
     replan_period: ClassVar[float] = 0.1  # [s]
     replan_until: ClassVar[float] = 0.4  # no new plan closer than this to the contact [s]
     contact_time: float = quantity(0.25, unit="s", low=0.0, high=2.0, doc="how long adhesion is awaited after the planned contact")
-    contact_early: ClassVar[float] = 0.15  # how long before the planned contact adhesion is looked for [s]
+    contact_early: ClassVar[float] = CONTACT_EARLY  # how long before the planned contact adhesion is looked for [s]
     waypoints: tuple[float, ...] = quantity((), unit="m, deg", doc="of an inspection, in map: x, y, z, yaw of each, one after the other")
     inspection_speed: float = quantity(0.5, unit="m/s", above=0.0, high=5.0, doc="mean speed between waypoints")
     rest_time: ClassVar[float] = 0.6  # rest with motors off that confirms the perch [s]
