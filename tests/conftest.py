@@ -76,3 +76,18 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     with reserved_domain() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         yield domain
+
+
+@pytest.fixture
+def executor(ros_domain):
+    """Of the nodes of a test, in a domain of their own; they are closed after it."""
+    import rclpy
+    from perch_core.ros.node import close_nodes
+    from rclpy.executors import SingleThreadedExecutor
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+    yield executor
+    close_nodes(executor.get_nodes())
+    rclpy.shutdown(context=context)

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
-rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("rclpy")
 
 from perch_core.component import Action, Client, Component, Service, Wake  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
-from perch_core.ros.node import close_nodes  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
 from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult  # noqa: E402
 from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
@@ -22,16 +18,8 @@ from perch_sim.ros.participant_node import ParticipantNode  # noqa: E402
 from perch_sim.ros.vehicle_node import VehicleNode  # noqa: E402
 from perch_sim.simulated_vehicle import SimulatedVehicle  # noqa: E402
 from rclpy.action import ActionClient  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
-
-PATIENCE = 120.0  # only ever waited for in full when a test fails [s]
-REQUEST = PerchPlanRequest(start=0, p=np.zeros(3), p_WS=np.array([1.7, 0.0, 0.0]), q_WS=np.array([1.0, 0.0, 0.0, 0.0]))
-
-
-@dataclass(frozen=True)
-class Nothing:
-    """No parameters."""
+from unit.test_requests_of_nodes import REQUEST, Nothing, until  # noqa: E402
 
 
 class Asking(Component[Nothing]):
@@ -64,16 +52,6 @@ class Serving(Component[Nothing]):
         self.replies.append(reply)
 
 
-@pytest.fixture
-def executor(ros_domain):
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    executor = SingleThreadedExecutor(context=context)
-    yield executor
-    close_nodes(executor.get_nodes())
-    rclpy.shutdown(context=context)
-
-
 def created(executor, host, kind, wiring=None, **parameters):
     """A node of a component."""
     given = [Parameter(name, value=value) for name, value in parameters.items()]
@@ -88,14 +66,6 @@ def participant(executor, kind):
     wiring = Wiring()
     wiring.schedule_here = True
     return created(executor, ParticipantNode, kind, wiring)
-
-
-def until(executor, done):
-    """Run callbacks until `done`."""
-    end = time.monotonic() + PATIENCE
-    while not done():
-        assert time.monotonic() < end, "it does not come"
-        executor.spin_once(0.1)
 
 
 def test_an_image_that_is_drawn_later_is_handed_to_neighbours_once_it_is_drawn(executor):

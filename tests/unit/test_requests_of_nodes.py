@@ -6,14 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-rclpy = pytest.importorskip("rclpy")
+pytest.importorskip("rclpy")
 
 from perch_core.component import Client, Component, Service, Unavailable  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.node import close_nodes  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
 from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
 PATIENCE = 120.0  # only ever waited for in full when a test fails [s]
 REQUEST = PerchPlanRequest(start=0, p=np.zeros(3), p_WS=np.array([1.7, 0.0, 0.0]), q_WS=np.array([1.0, 0.0, 0.0, 0.0]))
@@ -45,16 +44,6 @@ class Serving(Component[Nothing]):
     def on_plan_perch(self, request, reply) -> None:
         """At once."""
         reply(NONE)
-
-
-@pytest.fixture
-def executor(ros_domain):
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    executor = SingleThreadedExecutor(context=context)
-    yield executor
-    close_nodes(executor.get_nodes())
-    rclpy.shutdown(context=context)
 
 
 def node(executor, kind):
