@@ -65,6 +65,7 @@ def node():
     modules[names[-1]].common = SimpleNamespace(MAVLink=Encoders)
     sys.modules.update(modules)
     ours, theirs = socket.socketpair()
+    theirs.send(b"\0")  # what the stand-in takes for a heartbeat
     try:
         one = Mavlink(MavlinkParameters(link=f"fd:{ours.detach()}"))
     finally:

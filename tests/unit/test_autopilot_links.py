@@ -69,6 +69,7 @@ def test_a_full_port_gets_whole_frames_or_none():
     os.close(ours)
 
 
+@pytest.mark.slow
 def test_the_supervisor_sends_without_commands_reopens_the_link_and_ends_with_the_motors_off():
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(120.0)
@@ -137,6 +138,7 @@ def commanded(link: SupervisedLink, file: int, seconds: float, armed: bool | Non
     return switches
 
 
+@pytest.mark.slow
 def test_what_flies_is_landed_by_one_process_alone():
     """A node that ends in flight leaves the port to its supervisor; the next node gets it when the motors are off."""
     ours, theirs = pty.openpty()

@@ -23,6 +23,7 @@ def test_rounding_below_zero_is_zero():
     assert largest_sigma(np.diag([-1e-18, -1e-17])) == 0.0
 
 
+@pytest.mark.slow
 def test_drift_moves_the_vehicle_and_leaves_what_was_seen():
     """Against drawn poses: the place relative to the vehicle before and after the increment."""
     rng = np.random.default_rng(1)

@@ -79,6 +79,7 @@ def test_a_service_that_nobody_offers_is_named(executor, monkeypatch):
     assert asking.answers == [Unavailable("service plan_perch is not there")]
 
 
+@pytest.mark.slow
 def test_a_server_that_is_started_anew_while_nobody_asks_is_told(executor, monkeypatch):
     monkeypatch.setattr("perch_core.ros.asking.WATCH", 0.02)
     asking, told = node(executor, Asking), []
@@ -102,6 +103,7 @@ class Silent(Serving):
         self.asked = True
 
 
+@pytest.mark.slow
 def test_a_request_whose_server_ended_is_answered_by_the_one_that_was_started_anew_and_once(executor):
     asking, silent = node(executor, Asking).component, node(executor, Silent)
     asking.plan_perch(REQUEST, 0)

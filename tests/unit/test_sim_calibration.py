@@ -1,6 +1,7 @@
 """What is declared of the sensors is not what they are: scales of their own in every flight, heavy tails, and the same seed the same sensors."""
 
 import numpy as np
+import pytest
 
 from perch_core import so3
 from perch_core.vehicle import load_vehicle
@@ -24,6 +25,7 @@ def _errors() -> np.ndarray:
     return np.array(out)
 
 
+@pytest.mark.slow
 def test_calibration_errors_have_the_declared_size_and_heavier_tails_than_a_normal_distribution():
     errors = _errors()
     # A scale that is log-uniform between 1/1.5 and 1.5 has a mean square of 1.11.

@@ -36,6 +36,7 @@ def test_imu_at_rest_reads_plus_g_with_the_noise_of_its_file():
     assert abs(data[:, 2].mean() - GRAVITY) < 0.2
 
 
+@pytest.mark.slow
 def test_imu_biases_have_the_spread_of_the_file_and_walk():
     start = np.array([Imu(VEHICLE.imu, seeding.stream(seed, "imu")).bias for seed in range(400)])
     np.testing.assert_allclose(start.std(axis=0), np.repeat([0.05, 0.005], 3), rtol=0.15)

@@ -45,6 +45,7 @@ def test_starts_in_motion_from_vios_pose_and_velocity():
     assert np.linalg.norm(flight.error()[3:6]) < 0.15
 
 
+@pytest.mark.slow
 def test_tracks_a_perch_within_vios_own_drift():
     flight = Flight(5).fly(end=2400)
     errors = []
@@ -108,6 +109,7 @@ def test_nees_lies_within_its_bounds_where_vios_errors_are_white():
     assert result.mean.mean() > 0.6 * 9  # not hidden behind an inflated covariance
 
 
+@pytest.mark.slow
 def test_same_inputs_give_the_same_bits():
     a, b = Flight(6).fly(), Flight(6).fly()
     assert a.estimator.estimate.p_WB.tobytes() == b.estimator.estimate.p_WB.tobytes()

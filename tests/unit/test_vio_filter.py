@@ -126,6 +126,7 @@ def under_way():
     return pickle.loads(_under_way())
 
 
+@pytest.mark.slow
 def test_noisier_observations_are_as_if_declared_so():
     """Tracks with twice the declared noise give the state and the covariance of a filter that is told twice the noise."""
     declared = Run(2).config
@@ -177,6 +178,7 @@ def test_nees_on_exact_tracks_with_declared_noise():
         assert low < np.mean([end.nees(where) for end in ends]) < high, part
 
 
+@pytest.mark.slow
 def test_the_nis_of_a_frame_is_that_of_its_joint_innovations():
     """Summed over single landmarks it would leave out what they have in common: the pose."""
     run, expected = Run(2), []
@@ -214,6 +216,7 @@ def null_space(s):
     return N
 
 
+@pytest.mark.slow
 def test_yaw_and_position_stay_unobservable():
     """Every update's Jacobian is orthogonal to the null space at the present estimates."""
     run, angles = Run(2), []
@@ -324,6 +327,7 @@ def test_a_step_carries_the_scale_along(sigma):
     np.testing.assert_allclose(s.P, sigma**2 * np.outer(N, N), atol=1e-9 * sigma**2 * (N @ N))
 
 
+@pytest.mark.slow
 def test_yaw_gets_no_surer_than_it_was():
     run = Run(4)
     e3 = np.array([0.0, 0.0, 1.0])
@@ -337,6 +341,7 @@ def test_yaw_gets_no_surer_than_it_was():
         assert J @ s.P[k : k + 3, k : k + 3] @ J > 0.99 * first
 
 
+@pytest.mark.slow
 def test_tracks_that_jump_about_are_kept_out():
     run = Run(5)
     base, rng = run.tracks, np.random.default_rng(55)

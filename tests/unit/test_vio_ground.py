@@ -34,6 +34,7 @@ def standing(rng, height=STANDING):
     return filter, points, np.flatnonzero(valid), observe(MOUNT.camera, (pixels + noise)[valid])
 
 
+@pytest.mark.slow
 def test_points_of_the_ground_are_where_their_covariance_says():
     rng, squared = np.random.default_rng(1), []
     for _ in range(40):
@@ -71,6 +72,7 @@ def features_after_rising():
     return seen, between.min()
 
 
+@pytest.mark.slow
 def test_features_that_draw_together_make_room_for_others(monkeypatch):
     spread, apart = features_after_rising()
     monkeypatch.setattr(Tracker, "_thin", lambda self: None)

@@ -34,6 +34,7 @@ def outcomes(climb, drop, until=2.6):
     return out
 
 
+@pytest.mark.slow
 def test_a_shake_on_the_ground_is_rest_again():
     seen = outcomes(climb=1.5, drop=-1.5)
     assert {o for t, o, _ in seen if 0.5 < t < 1.0} == {FrameOutcome.RESTING}
@@ -49,6 +50,7 @@ def test_a_steady_climb_is_not_rest():
     assert late[-1][1] == pytest.approx(0.015 + 0.3 * (seen[-1][0] - 1.1), abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leaves", [False, True])
 def test_a_camera_that_was_silent_for_longer_than_the_imu_is_kept_is_used_again(leaves):
     """At rest it rests where it did. Where it moved when the images stopped, position and heading are as uncertain as they then are."""
@@ -127,6 +129,7 @@ def test_errors_at_rest_are_as_large_as_the_covariance_says():
     assert 10.0 < np.mean([e @ np.linalg.solve(P, e) for e, P in ends]) < 21.0  # chi2, 15 x 12, 99.9 %, about
 
 
+@pytest.mark.slow
 def test_what_is_said_of_now_holds_while_a_departure_is_not_yet_noticed():
     """A climb that begins as smoothly as in `PerchMotion`, z = 4.6 m/s^5 t^5: when it is noticed, the vehicle has 10 cm/s."""
     rng, out = np.random.default_rng(3), []
@@ -151,6 +154,7 @@ def test_what_is_said_of_now_holds_while_a_departure_is_not_yet_noticed():
         assert 1.0 < nees[(times > begin) & (times < end)].mean() < 3.0  # 2 if all is as it says; "at rest" makes it 3.8 at the end
 
 
+@pytest.mark.slow
 def test_a_departure_from_a_wall_in_the_dark_is_noticed():
     vio, outcomes, _, fly = rest(2, "wall", (5.0,), True, fps=30.0)
     fly(5.6, force=np.array([-2.0, 0.0, 0.0]))

@@ -67,6 +67,7 @@ def test_a_start_in_motion_is_as_wrong_as_it_says():
     assert max(t for _, _, t in ends) < 0.7  # at the second trial, if not at the first
 
 
+@pytest.mark.slow
 def test_a_start_in_motion_waits_where_nothing_tells_the_scale():
     """0.3 m/s with 0.2 m/s^2: half a second of that is less than the accelerometer's bias and noise."""
     assert begin("slow", 0, give_up=0.65) is None

@@ -170,6 +170,7 @@ def test_a_state_that_cannot_be_is_noticed(change, words):
     assert any(words in r.message and r.outcome is FrameOutcome.LOST for _, r, _ in out)
 
 
+@pytest.mark.slow
 def test_drift_hardly_depends_on_the_rate_of_the_imu():
     """One second on the IMU alone, at 1000 Hz and at 100 Hz with means of ten samples: errors, and what the filter says of them."""
     config, ends, sigmas = VioConfig(), {1: [], 10: []}, {}
