@@ -33,7 +33,7 @@ from closed_loop.truth import TruthEstimator
 from perch_sim.lockstep import Task
 
 PERIOD = 0.002
-EVERY_STEP = ControllerChoice(reference_period=PERIOD)
+EVERY_STEP = ControllerChoice(reference_period=PERIOD, adaptive=False)  # the law alone; a test of L1 adds it
 
 
 @dataclass(frozen=True)

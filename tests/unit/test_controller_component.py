@@ -481,7 +481,7 @@ def test_the_period_of_the_reference_changes_in_flight(period, count):
 
 
 def test_a_parameter_leaves_alone_what_the_service_has_chosen():
-    component = Controller(parameters())
+    component = Controller(parameters(adaptive=False))
     component._assembly.choose("geometric", True)
     component.reconfigure(replace(component.config, flight=replace(component.config.flight, silence_time=50.0)))
     assert component.flight.law_name == "geometric+l1"
@@ -533,7 +533,7 @@ def test_the_law_of_the_guide_flies(tmp_path, monkeypatch):
     name, place = re.search(r'^"(\w+)": "([\w:.]+)",$', GUIDE.read_text(), re.M).groups()
     monkeypatch.setitem(LAWS, name, place.removeprefix("perch_control."))  # here the file is on the path
     flight = Flight(params=parameters(type=name)).take_off()
-    assert flight.status[-1].controller == "pd"
+    assert flight.status[-1].controller == "pd+l1"
     flight.follow(flight.path((0, 0, 0.6), (1.5, 1.0, 1.0), 2.0), id=6)
     flight.step(1.0)
     reference = np.array(flight.references[-1].p)

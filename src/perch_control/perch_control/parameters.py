@@ -20,7 +20,7 @@ class ControllerChoice:
     """Which control law flies."""
 
     type: str = text("geometric", doc="control law, one of perch_control.laws (geometric, nmpc); service set_controller changes it, too")
-    adaptive: bool = quantity(False, doc="L1 augmentation on force and moment")
+    adaptive: bool = quantity(True, doc="L1 augmentation on force and moment")
     l1_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=100.0, doc="of what the augmentation makes up for, force and moment")
     reference_period: float = quantity(0.01, unit="s", above=0.0, high=1.0, doc="of controller/reference")
 
