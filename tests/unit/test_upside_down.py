@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,8 +46,8 @@ def controller_stops(loop, lasting):
 
 @pytest.fixture(scope="module")
 def hovering():
-    """A flight on its way; each fault comes to it as it is here."""
-    scenario = load_scenario("surface_90")
+    """A flight on its way; each fault comes to it as it is here. Without L1: its falls end upside down."""
+    scenario = replace(load_scenario("surface_90"), parameters={"controller": {"controller.adaptive": False}})
     loop = arrange(scenario, 1)
     loop.send("mission", goal_of(scenario))
     while loop.time < HOVER:

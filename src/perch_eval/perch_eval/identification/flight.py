@@ -23,7 +23,7 @@ PAUSE = 0.3                                        # between them [s]
 
 
 def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Flight:
-    """Fly it in the simulator, with estimated state.
+    """Fly it in the simulator, with estimated state, and without L1: its corrections follow the response that is to be found.
 
     Args:
         scenario: the room and how the real vehicle differs from its file.
@@ -34,7 +34,10 @@ def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Fl
     Raises:
         PerchError: the vehicle does not fly with this file.
     """
-    flight = ScriptedFlight(replace(scenario, vehicle=vehicle), seed, without=("powerline_mapper", "perching_planner", "powerline_planner"))
+    parameters = scenario.parameters or {}
+    without_l1 = parameters | {"controller": parameters.get("controller", {}) | {"controller.adaptive": False}}
+    flight = ScriptedFlight(replace(scenario, vehicle=vehicle, parameters=without_l1), seed,
+                            without=("powerline_mapper", "perching_planner", "powerline_planner"))
     mission, controller = flight.mission, flight.controller.flight
     with closing(flight.loop):
         flight.run(flight.arm() + 0.1)
