@@ -27,7 +27,7 @@ def ended(loop, goal, limit=40.0):
     return sent.result
 
 
-SEEDS = {"surface_90": 1, "line_80": 2}  # with seed 1 the gripper misses the wire at the second perch, by millimetres
+SEEDS = {"surface_90": 1, "line_80": 2}  # with seed 1 the gripper misses the wire at the second perch
 
 
 @cache
