@@ -35,6 +35,7 @@ def broken(effort):
     raise RuntimeError("no fuel")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts, code", [
     ({"a": part(True, True)}, 0), ({"a": part(True, False)}, 1), ({"a": part(True, missing=True)}, 3),
     ({"a": part(False, missing=True)}, 1), ({"a": broken}, 3), ({"a": broken, "b": part(False)}, 1)])
