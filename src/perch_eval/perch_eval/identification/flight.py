@@ -34,11 +34,9 @@ def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Fl
     Raises:
         PerchError: the vehicle does not fly with this file.
     """
-    parameters = scenario.parameters or {}
-    without_l1 = parameters | {"controller": parameters.get("controller", {}) | {"controller.adaptive": False}}
-    flight = ScriptedFlight(replace(scenario, vehicle=vehicle, parameters=without_l1), seed,
-                            without=("powerline_mapper", "perching_planner", "powerline_planner"))
+    flight = ScriptedFlight(replace(scenario, vehicle=vehicle), seed, without=("powerline_mapper", "perching_planner", "powerline_planner"))
     mission, controller = flight.mission, flight.controller.flight
+    controller.compensator = None
     with closing(flight.loop):
         flight.run(flight.arm() + 0.1)
         place, yaw = mission.p_WB, 0.0
