@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from perch_core import config
 from perch_core.errors import ConfigError
 from perch_core.values import Contact
 from perch_eval import demo
@@ -22,11 +23,11 @@ from perch_eval.campaign.distributions import parse
 from perch_eval.campaign.engines import Task, carry_out
 from perch_eval.campaign.figures import Axis
 from perch_eval.campaign.results import Results, ResultsError, RunResult, read_results, worst
-from perch_eval.campaign.specification import Run, load_campaign, scenario_of
+from perch_eval.campaign.specification import Run, load_campaign
 from perch_eval.evaluation import command as evaluation
 from perch_eval.statistics import Rate, Spread
 from perch_sim.contact_event import ContactState
-from perch_sim.scenario import Adhesion
+from perch_sim.scenario import Adhesion, Scenario
 
 
 def write(folder, text):
@@ -68,7 +69,7 @@ vary:
     points = [(r.values["target.distance"], r.values["target.inclination_deg"]) for r in campaign.runs]
     assert all(points.count(p) == 3 for p in set(points)) and len(set(points)) == 4
     run = campaign.runs[7]
-    scenario = scenario_of(campaign.mapping(run), "c")
+    scenario = config.from_mapping(Scenario, campaign.mapping(run), "c")
     assert scenario.target.distance == run.values["target.distance"]
     assert scenario.wind.steady == (0.0, run.values["wind.steady.1"], 0.0)
     assert scenario.parameters["controller"]["gains.lead"] == run.values["parameters.controller.gains.lead"]
@@ -103,7 +104,7 @@ def test_a_flight_keeps_its_seed_whatever_is_varied(tmp_path):
 
 def test_an_entry_of_a_vector_leaves_the_others_as_they_are(tmp_path):
     campaign = load_campaign(write(tmp_path, "name: g\nruns: 1\nvary: {disturbance.rotor_thrust_factor.1: {grid: [0.9]}, world.room.2: {grid: [5.0]}}\n"))
-    scenario = scenario_of(campaign.mapping(campaign.runs[0]), "c")
+    scenario = config.from_mapping(Scenario, campaign.mapping(campaign.runs[0]), "c")
     assert scenario.disturbance.rotor_thrust_factor == (1.0, 0.9, 1.0, 1.0) and scenario.world.room == (10.0, 5.0, 5.0)
 
 

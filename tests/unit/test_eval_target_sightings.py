@@ -22,8 +22,7 @@ def hover():
     motion = motion_of(scenario, 3)
     truth = motion.sample(np.arange(0.0, motion.duration - 0.003, 0.02))
     nothing = np.zeros((len(truth.times), 3))
-    return scenario, Flight(motion, truth, ImuReadings(nothing, nothing, nothing, nothing), load_vehicle("snapdragon").mounts["down"],
-                            (), motion.duration - motion.settings.perch)
+    return scenario, Flight(motion, truth, ImuReadings(nothing, nothing, nothing, nothing), load_vehicle("snapdragon").mounts["down"], ())
 
 
 def track_of(flight, error=np.zeros(15), sigma=1e-3):

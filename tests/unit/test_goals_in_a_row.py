@@ -96,12 +96,12 @@ def test_another_writers_bad_imu_samples_leave_no_trace_of_themselves():
     scenario = load_scenario("surface_90")
     loop = arrange(scenario, 1)
     sent = loop.send("mission", goal_of(scenario))
+    steps = 0
     while sent.result is None and loop.time < 60.0:
-        loop.step()
-        if 1000 <= loop.index < 1400:
-            stamp = loop.stamp + (2_000_000, 1_000_000, 0)[loop.index % 3]
+        stamp, steps = loop.step(), steps + 1
+        if 1000 <= steps < 1400:
             for name in ("estimator", "controller", "mission"):
-                loop.components[name].on_imu(ImuSample(stamp, (math.nan,) * 3, (0.0, 0.0, math.inf)))
+                loop.components[name].on_imu(ImuSample(stamp + (2_000_000, 1_000_000, 0)[steps % 3], (math.nan,) * 3, (0.0, 0.0, math.inf)))
     assert sent.result is not None and sent.result.success
     assert loop.trace.flight.digest(loop.time) == perched("surface_90")[2]
     loop.close()

@@ -7,6 +7,7 @@ simulator's, the motion is exact (`perch_motion`), and nothing of the truth reac
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -140,8 +141,7 @@ class _Vehicle(Component[NoParameters]):
         super().__init__(NoParameters())
         self._flight, self._transport = flight, transport
         self._k = int(np.searchsorted(flight.truth.times, begin))
-        self._frames = iter([frame for frame in flight.frames if frame[0] >= begin])
-        self._coming = next(self._frames, None)
+        self._frames = deque(frame for frame in flight.frames if frame[0] >= begin)
         self.time = 0
 
     @property
@@ -156,9 +156,8 @@ class _Vehicle(Component[NoParameters]):
         self._k, self.time = self._k + 1, sample.stamp
         self.imu(sample)
         arrivals = []
-        while self._coming is not None and self._coming[0] + self._transport <= at:
-            arrivals.append(self._show(*self._coming))
-            self._coming = next(self._frames, None)
+        while self._frames and self._frames[0][0] + self._transport <= at:
+            arrivals.append(self._show(*self._frames.popleft()))
         return arrivals
 
     def _show(self, middle: float, stamp: int, pixels: np.ndarray) -> Arrival:

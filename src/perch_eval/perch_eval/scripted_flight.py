@@ -165,7 +165,6 @@ class ScriptedFlight:
         loop: everything that flies.
         mission: gives the orders.
         simulation: the vehicle.
-        plan: trajectory of the perch that was ordered.
         events: (time [s], state of the controller, text) of its log.
     """
 
@@ -184,7 +183,6 @@ class ScriptedFlight:
         self.loop = arrange(scenario, seed, without=("target_localizer", *without), script=self.mission)
         self.simulation = self.loop.vehicle.simulation
         self.controller: Controller = self.loop.components["controller"]
-        self.plan: FlatTrajectory | None = None
         self.events: list[tuple[float, str, str]] = []
         self.controller.log.receivers.append(lambda line: self.events.append((self.time, self.state.name, line.text)))
 
@@ -251,5 +249,5 @@ class ScriptedFlight:
         if not self.mission.resting:
             return None
         shift, pad = self.mission.p_WB - self.simulation.state.p_WB, self.simulation.pad
-        self.plan = self.perch_plan(place, self.time + 2.0 * LEAD, shift)
-        return self.mission.perch(self.plan, Target(self.time, pad.p_WS + shift, so3.quat_from_matrix(pad.R_WS), 0.0, 0.0))
+        plan = self.perch_plan(place, self.time + 2.0 * LEAD, shift)
+        return self.mission.perch(plan, Target(self.time, pad.p_WS + shift, so3.quat_from_matrix(pad.R_WS), 0.0, 0.0))

@@ -40,9 +40,10 @@ def cause_of(outcome: str, contacts: Sequence[Contact], adhesion: Adhesion) -> s
         return _BY_OUTCOME[outcome]
     if not touches:
         return "missed_pad" if outcome == "missed" else "lost_track"
-    if any(c.state == ContactState.COLLISION for c in touches[:1]) or any("crashed" in c.reason for c in touches):
-        return "crash" if touches[0].body != "pad" or touches[0].state == ContactState.COLLISION else _bounce(touches[0], adhesion)
-    return _bounce(touches[0], adhesion)
+    first = touches[0]
+    if first.state == ContactState.COLLISION or first.body != "pad" and any("crashed" in c.reason for c in touches):
+        return "crash"
+    return _bounce(first, adhesion)
 
 
 def _bounce(touch: Contact, adhesion: Adhesion) -> str:

@@ -14,17 +14,18 @@ from typing import Any
 import cv2
 import yaml
 
+from perch_core import config
 from perch_core.errors import PerchError
 from perch_core.processes import one_thread_for_sums
 from perch_core.registry import resolved
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.results import RunResult
-from perch_eval.campaign.specification import Campaign, Run, scenario_of
+from perch_eval.campaign.specification import Campaign, Run
 from perch_eval.flight import Flight
 from perch_eval.in_process import Sensing, fly
 from perch_eval.metrics import figures, flight_metrics
-from perch_sim.scenario import Scenario
+from perch_sim.scenario import Scenario, load_scenario
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def fly_in_process(task: Task, measure: Measure = lambda *_: {}, linger: float =
         measure: further figures of the flight.
         linger: flown on after its end [s].
     """
-    scenario = scenario_of(task.scenario, f"run {task.run.number}")
+    scenario = config.from_mapping(Scenario, task.scenario, f"run {task.run.number}")
     trace = fly(scenario, task.run.seed, task.sensing, 0.5 if task.keep else linger)
     vehicle = load_vehicle(scenario.vehicle)
     metrics = figures(flight_metrics(trace.flight, vehicle, trace.end_time), trace.end_time)
@@ -120,7 +121,7 @@ def fly_on_the_stack(task: Task) -> RunResult:
         with contextlib.redirect_stdout(log):
             report = fly(str(file), task.run.seed, folder, composed=ALL_NODES)
         contacts = [contact for _, contact in RecordedFlight(folder / "flight.mcap").values("contact")]
-        adhesion = scenario_of(task.scenario, str(file)).adhesion
+        adhesion = load_scenario(file).adhesion
     return RunResult(task.run.number, task.run.seed, cause_of(report["outcome"], contacts, adhesion), report["outcome"],
                      report["message"], metrics=figures(report, report["simulated_time_s"]))
 

@@ -90,15 +90,6 @@ class Campaign:
         return out
 
 
-def scenario_of(mapping: Mapping[str, Any], source: str) -> Scenario:
-    """The scenario of a run.
-
-    Raises:
-        ConfigError: a value is out of range, or a name is unknown.
-    """
-    return config.from_mapping(Scenario, dict(mapping), source)
-
-
 def load_campaign(path: Path | str, engine: str | None = None, runs: int | None = None) -> Campaign:
     """Read a campaign's file and draw its runs.
 
@@ -144,7 +135,7 @@ def _check(campaign: Campaign, file: str) -> None:
     different = {json.dumps(run.values): run for run in reversed(campaign.runs)}
     for run in sorted(different.values(), key=lambda run: run.number):
         source = f"{file}: run {run.number} ({in_words(run.values)})"
-        scenario = scenario_of(campaign.mapping(run), source)
+        scenario = config.from_mapping(Scenario, campaign.mapping(run), source)
         named = scenario.vehicle, scenario.target.board
         if named not in vehicles:
             vehicles[named] = check_names(scenario, source)

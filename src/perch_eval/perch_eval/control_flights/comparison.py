@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight, scenario_of
@@ -29,21 +27,13 @@ SETTLE, HOVER = 1.5, 0.5
 LINE, LINE_TIME = np.array([0.7, 1.0, 0.4]), 2.0  # [m], [s]
 
 
-@dataclass(frozen=True)
-class Compared:
-    """One flight.
+def fly(controller: str, condition: str, maneuver: str, seed: int) -> tuple[np.ndarray, str]:
+    """Take off, hover until the adaptation has settled, then a line and a hover, or the perch on the wall; estimated state.
 
-    Attributes:
-        rmse: true position against the reference per axis [m], shape (3,); nan where the manoeuvre was not begun.
+    Returns:
+        RMSE of the true position against the reference per axis [m], shape (3,), nan where the manoeuvre was not begun; and the
         outcome: held, perched, or what went wrong.
     """
-
-    rmse: tuple[float, float, float]
-    outcome: str
-
-
-def fly(controller: str, condition: str, maneuver: str, seed: int) -> Compared:
-    """Take off, hover until the adaptation has settled, then a line and a hover, or the perch on the wall; estimated state."""
     law, adaptive = CONTROLLERS[controller]
     flight = ScriptedFlight(scenario_of(SCENARIO, CONDITIONS[condition], {"controller.type": law, "controller.adaptive": adaptive}), seed)
     flight.arm()
@@ -63,7 +53,7 @@ def fly(controller: str, condition: str, maneuver: str, seed: int) -> Compared:
         end = mission.contact_due
         flight.run(min(end, flight.time + 10.0) + 1.0)
     if order is None or not flight.flew(order):
-        return Compared((np.nan,) * 3, f"not begun: {flight.events[-1][2]}")
+        return np.full(3, np.nan), f"not begun: {flight.events[-1][2]}"
     flown = flight.loop.trace.flight
     # A vehicle that has touched the wall follows no reference.
     touched = min([t for t, c in flown.values("contact") if t > begin], default=np.inf)
@@ -71,8 +61,7 @@ def fly(controller: str, condition: str, maneuver: str, seed: int) -> Compared:
     assert wanted is not None
     during = (wanted.t >= begin) & (wanted.t <= min(end if maneuver == "perch" else np.inf, touched))
     times, p = wanted.t[during], wanted.p[during]
-    rmse = np.sqrt(np.mean((p - flown.known_states("ground_truth/odometry").at(times).p) ** 2, axis=0))
-    return Compared(tuple(rmse.tolist()), _outcome(flight, maneuver))
+    return np.sqrt(np.mean((p - flown.known_states("ground_truth/odometry").at(times).p) ** 2, axis=0)), _outcome(flight, maneuver)
 
 
 def _outcome(flight: ScriptedFlight, maneuver: str) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,28 +44,30 @@ def search(plant: Plant) -> Search:
     Args:
         plant: as the fault has left it; it is copied.
     """
+    tried, latest, survived = 0, 0.0, False
+    for periods, survived in _sequences(plant):
+        tried, latest = tried + 1, max(latest, periods * CONTROL_PERIOD)
+        if survived:
+            break
+    return Search(tried, int(survived), latest, _greatest_turn(plant, latest))
+
+
+def _sequences(plant: Plant) -> Iterator[tuple[int, bool]]:
+    """Every sequence of commands: the control periods flown, and whether nothing broke."""
     corners = [np.array(c) for c in itertools.product((plant.body.speed_min, plant.body.speed_max), repeat=4)]
     steps = round(HORIZON / CONTROL_PERIOD)
     switches = sorted(round(t / CONTROL_PERIOD) for t in SWITCHES)
-    tried, latest = 0, 0.0
     for first in corners:
         now, done = copy.deepcopy(plant), 0
         for switch in (*switches, steps):
             done += _advance(now, first, switch - done)
             if now.crashed or switch == steps:
-                tried, latest = tried + 1, max(latest, done * CONTROL_PERIOD)
-                if not now.crashed:
-                    return Search(tried, 1, latest, _greatest_turn(plant, latest))
+                yield done, not now.crashed
                 break
             for second in corners:
-                if second is first:
-                    continue
-                then = copy.deepcopy(now)
-                more = _advance(then, second, steps - done)
-                tried, latest = tried + 1, max(latest, (done + more) * CONTROL_PERIOD)
-                if not then.crashed:
-                    return Search(tried, 1, latest, _greatest_turn(plant, latest))
-    return Search(tried, 0, latest, _greatest_turn(plant, latest))
+                if second is not first:
+                    then = copy.deepcopy(now)
+                    yield done + _advance(then, second, steps - done), not then.crashed
 
 
 def _advance(plant: Plant, command: np.ndarray, steps: int) -> int:

@@ -25,6 +25,7 @@ STATES = "estimator: all 15 states"
 BAR = 0.85  # of the time inside the bounds
 GROUPS = {STATES: slice(0, 15), "estimator: position": slice(0, 3), "estimator: velocity": slice(3, 6),
           "estimator: attitude": slice(6, 9)}
+TARGET_GROUPS = {"target: pose": slice(0, 6), "target: position": slice(0, 3), "target: attitude": slice(3, 6)}
 AIRBORNE_AFTER = 0.4  # from the first thrust until the vehicle is clear of the ground [s]
 LOOK = (-1.5, 0.4)    # the pad is looked at from the hover until it leaves the view, relative to the perch's begin [s]
 
@@ -50,14 +51,12 @@ def consistency_sections(effort: Effort) -> list[Section]:
     found = dict(counted(in_processes(_fly, list(effort.seeds), effort.jobs), len(effort.seeds), what="perches"))
     flown = [found[seed] for seed in effort.seeds]
     n = min(len(one.track.times) for one in flown)
-    times = flown[0].track.times[:n]
-    errors = np.array([one.track.errors[:n] for one in flown])
-    covariances = np.array([one.track.covariances[:n] for one in flown])
-    results = [consistency.judge(name, times, consistency.nees(errors[..., s], covariances[..., s, s]), s.stop - s.start)
-               for name, s in GROUPS.items()]
+    results = _judged(GROUPS, flown[0].track.times[:n], [one.track.errors[:n] for one in flown], [one.track.covariances[:n] for one in flown])
     grid = np.arange(motion.settings.ground + AIRBORNE_AFTER, motion.duration - 0.1, 1 / 30)
     results.append(consistency.judge("vio: pose", grid, np.array([np.interp(grid, one.vio_times, one.vio_nees) for one in flown]), 6))
-    results += _judge_target([one.sightings for one in flown])
+    seen = np.isfinite([one.sightings.errors for one in flown]).all(axis=(0, 2))  # images in which every run found the pad
+    results += _judged(TARGET_GROUPS, flown[0].sightings.times[seen], [one.sightings.errors[seen] for one in flown],
+                       [one.sightings.covariances[seen] for one in flown])
     for r in results:
         words = f"{r.mean.mean() / r.dimension:.2f}; {100 * r.inside:.0f} % inside, {100 * r.above:.0f} % above"
         if r.name == STATES:
@@ -89,10 +88,7 @@ def _fly(seed: int) -> _Run:
                 see_target(scenario, flight, track, seed, flight.motion.perch_time + LOOK[0], flight.motion.perch_time + LOOK[1]))
 
 
-def _judge_target(sightings: list[Sightings]) -> list[Consistency]:
-    """NEES of the target's pose, at the images in which every run found the pad."""
-    errors, covariances = np.array([s.errors for s in sightings]), np.array([s.covariances for s in sightings])
-    seen = np.isfinite(errors).all(axis=(0, 2))
-    groups = {"target: pose": slice(0, 6), "target: position": slice(0, 3), "target: attitude": slice(3, 6)}
-    return [consistency.judge(name, sightings[0].times[seen], consistency.nees(errors[:, seen, s], covariances[:, seen, s, s]),
-                              s.stop - s.start) for name, s in groups.items()]
+def _judged(groups: dict[str, slice], times: np.ndarray, errors: list[np.ndarray], covariances: list[np.ndarray]) -> list[Consistency]:
+    """NEES of parts of a state over runs, each with errors (m, n) and covariances (m, n, n) at m times."""
+    e, P = np.array(errors), np.array(covariances)
+    return [consistency.judge(name, times, consistency.nees(e[..., s], P[..., s, s]), s.stop - s.start) for name, s in groups.items()]

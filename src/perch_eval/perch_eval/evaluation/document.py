@@ -59,8 +59,7 @@ def _page(sections: Sequence[Section], duration: float) -> list[str]:
              "**M**: Mao et al., *Aggressive Visual Perching with Quadrotors on Inclined Surfaces*. "
              "**P**: Paneque et al., *Perception-Aware Perching on Powerlines with Multirotors*. "
              "The papers flew in a laboratory, this is simulation: a better value here does not mean a better vehicle.", ""]
-    for failing in [(s, row) for s in sections for row in s.rows if row.verdict == FAILS]:
-        lines.append(f"* fails: {failing[0].title}: {failing[1].name}: {failing[1].ours} ({failing[1].note})")
+    lines += [f"* fails: {s.title}: {row.name}: {row.ours} ({row.note})" for s in sections for row in s.rows if row.verdict == FAILS]
     for section in sections:
         lines += ["", f"## {section.title}", "", section.about, ""]
         if section.rows:

@@ -6,6 +6,7 @@ import math
 import multiprocessing
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +50,9 @@ def perching_sections(effort: Effort) -> list[Section]:
 
 def perches(effort: Effort) -> dict[str, list[RunResult]]:
     """The flights of each condition; finished ones of the same code are not flown again."""
-    tasks = []
-    for number, (name, seed) in enumerate((name, seed) for seed in effort.seeds for name in (*CONDITIONS, AGGRESSIVE)):
-        mapping = extended_mapping("scenarios", name)
-        tasks.append(Task(Run(number, seed, {"scenario": name}), mapping, "in_process", SENSING))
-    found = flown(effort, "flights", tasks)
+    jobs = enumerate(product(effort.seeds, (*CONDITIONS, AGGRESSIVE)))
+    found = flown(effort, "flights", [Task(Run(number, seed, {"scenario": name}), extended_mapping("scenarios", name), "in_process", SENSING)
+                                      for number, (seed, name) in jobs])
     return {name: [r for r in found if r.values["scenario"] == name] for name in (*CONDITIONS, AGGRESSIVE)}
 
 

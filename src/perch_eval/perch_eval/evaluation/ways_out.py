@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +33,7 @@ RATE = 20.0                                               # instants per second 
 INCLINATIONS = (60, 90, 120)                              # [deg]
 LINES = ("line_20", "line_20_pa", "line_80", "line_80_pa", "line_180")
 PLANS, LINE_PLANS = 20, 2                                 # of each
-EDGES = (0.05, 0.1, 0.15, 0.3, 0.5, 0.7, 1.0, math.inf)   # of time to contact [s]
+EDGES = (0.0, 0.05, 0.1, 0.15, 0.3, 0.5, 0.7, 1.0, math.inf)  # of time to contact [s]
 FLOWN = {"surface_60": 8, "surface_90": 12, "line_80": 2}  # flights that are cancelled, each at another time
 EARLIEST = 1.4                                            # time to contact at which the first of them is cancelled [s]
 SURE = MissionSettings().contact_early                    # nearer to the contact a surface may already be touched [s]
@@ -60,21 +61,19 @@ def sections(effort: Effort) -> list[Section]:
     for name in (*map(str, INCLINATIONS), *LINES):
         plans = [r for r in made if r["name"] == name]
         instants = [Instant(*pair) for r in plans for pair in r["instants"]]
-        cells = []
-        for low, high in zip((0.0, *EDGES), EDGES):
-            within = [not x.refusal for x in instants if low <= x.left < high]
-            cells.append(f"{sum(within)} of {len(within)}" if within else "")
-        kept = [not x.refusal for x in instants]
+        spans = [[x for x in instants if low <= x.left < high] for low, high in pairwise(EDGES)]
         title = f"{name} deg" if name.isdigit() else name
-        rows.append((title, *cells, f"{sum(kept)} of {len(kept)}"))
+        rows.append((title, *(_share(span) if span else "" for span in spans), _share(instants)))
         reasons.update(f"{title}: {x.refusal}" for x in instants if x.refusal)
-        early = [not x.refusal for x in instants if x.left >= SURE]
+        early = [x for x in instants if x.left >= SURE]
         planned = sum(not r["refused"] for r in plans)
-        out.claim(f"{title}: a way out {SURE:g} s before contact and earlier", f"{sum(early)} of {len(early)}; {planned} of {len(plans)} planned", "",
-                  planned == len(plans) and sum(early) >= BAR * len(early) if early else None, f"at least {100 * BAR:g} %, all planned")
+        out.claim(f"{title}: a way out {SURE:g} s before contact and earlier", f"{_share(early)}; {planned} of {len(plans)} planned", "",
+                  planned == len(plans) and sum(not x.refusal for x in early) >= BAR * len(early) if early else None,
+                  f"at least {100 * BAR:g} %, all planned")
     flown = computed(effort, "aborted", list(_aborts()), _flown, lambda r: r["end"] in ("hovering", "attached"))
     text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
-            *table(" | ".join(("plans", *map(_span, range(len(EDGES))), "all")), rows), "", "## Refused", ""]
+            *table(" | ".join(("plans", *(f"{low:g} to {high:g}" for low, high in pairwise(EDGES[:-1])), f"from {EDGES[-2]:g}", "all")), rows), "",
+            "## Refused", ""]
     text += [f"* {n}x {reason}" for reason, n in reasons.most_common()] or ["None."]
     text += ["", "## Cancelled flights", "", "The goal is cancelled on the way (modelled cameras, seeds from 1). *by a way out*: the controller left the "
              "plan by a planned way out; *attached*: cancelled too late, the perch went on.", ""]
@@ -96,9 +95,9 @@ def sections(effort: Effort) -> list[Section]:
     return [out]
 
 
-def _span(k: int) -> str:
-    low = (0.0, *EDGES)[k]
-    return f"{low:g} to {EDGES[k]:g}" if math.isfinite(EDGES[k]) else f"from {low:g}"
+def _share(instants: Sequence[Instant]) -> str:
+    """How many of them have a way out."""
+    return f"{sum(not x.refusal for x in instants)} of {len(instants)}"
 
 
 def _aborts() -> Iterator[tuple[str, int, float]]:

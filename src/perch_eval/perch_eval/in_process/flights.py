@@ -118,7 +118,6 @@ def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
         end = stamp + round(linger * NANOSECONDS)
         while stamp < end:
             stamp = loop.step()
-    trace.pad = loop.vehicle.simulation.pad
     if result is None:
         trace.outcome, trace.message = "timeout", f"no end within {trace.end_time:.1f} s"
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from perch_core.component import Component, LogLine
+from perch_core.component import Component
 from perch_core.errors import PerchError
 from perch_core.processes import one_thread_for_sums
 from perch_core.values import PerchGoal, PerchResult, seconds
@@ -30,12 +30,11 @@ class SentGoal:
         self.value, self.feedback = value, told
         self.cancel_requested = False
         self.rejected = ""
-        self.ending = ""
         self.result: PerchResult | None = None
 
     def finish(self, ending: str, result: PerchResult) -> None:
         """It has ended."""
-        self.ending, self.result = ending, result
+        self.result = result
 
 
 class _Reached(LocalParticipant):
@@ -86,24 +85,13 @@ class Loop:
         members = {name: _Reached(component, self.filters, ask=ask, name=name) for name, component in components.items()}
         self._participants = asked | members
         self._schedule = Schedule(vehicle, members.values(), tasks)
-        for name, component in {"vehicle": vehicle, **self.components}.items():
+        for component in (vehicle, *self.components.values()):
             self.trace.tap(component)
-            component.log.receivers.append(self._logged(name))
-
-    @property
-    def stamp(self) -> int:
-        """Of the present step [ns]."""
-        return self._schedule.now
 
     @property
     def time(self) -> float:
         """Of the present step [s]."""
         return seconds(self._schedule.now)
-
-    @property
-    def index(self) -> int:
-        """Steps so far."""
-        return self._schedule.index
 
     def step(self) -> int:
         """One control period.
@@ -143,6 +131,3 @@ class Loop:
         """Free what the components hold."""
         for component in (self.vehicle, *self.components.values()):
             component.close()
-
-    def _logged(self, name: str) -> Callable[[LogLine], None]:
-        return lambda line: self.trace.log.append((self.time, name, line.level, line.text))

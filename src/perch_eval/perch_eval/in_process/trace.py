@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from perch_core.component import Component, Output, ports
-from perch_core.surface import PerchSurface
 from perch_core.values import Contact, TrajectoryOrder, nanoseconds
 from perch_eval.flight import Flight, timed
 
@@ -16,24 +15,20 @@ def stamp_of(value: Any) -> int:
 
 
 class FlightTrace:
-    """One flight. `trace[channel]` is a list of (stamp [ns], value) in the order of emission; empty where there is none.
+    """One flight.
 
     Attributes:
         outcome: `perched`, or the lower-case name of the mission's result; `timeout` past the time limit.
         message: the mission's words.
         end_time: when the goal ended [s].
         wall_time: what it took [s].
-        pad: the true pad at the end.
         phases: (time [s], phase, message) of the mission whenever they change.
-        log: (time [s], name of the component, level, text) of each line.
     """
 
     def __init__(self) -> None:
         self.outcome, self.message = "failed", ""
         self.end_time = self.wall_time = float("nan")
-        self.pad: PerchSurface | None = None
         self.phases: list[tuple[float, str, str]] = []
-        self.log: list[tuple[float, str, str, str]] = []
         self._values: dict[str, list[Any]] = {}
 
     def tap(self, component: Component[Any]) -> None:
@@ -43,26 +38,19 @@ class FlightTrace:
             if port is not Component.log and not channel.startswith(("/", "camera_")) and channel != "vio/debug_image":
                 getattr(component, port.name).receivers.append(self._values.setdefault(channel, []).append)
 
-    @property
-    def channels(self) -> list[str]:
-        """Those that have values."""
-        return sorted(channel for channel, values in self._values.items() if values)
-
-    def __getitem__(self, channel: str) -> list[tuple[int, Any]]:
-        return [(stamp_of(value), value) for value in self._values.get(channel, ())]
-
     def values(self, channel: str) -> list[Any]:
-        """The values of a channel in the order of emission."""
+        """The values of a channel in the order of emission; empty where there are none."""
         return list(self._values.get(channel, ()))
 
     def timeline(self) -> list[tuple[str, int, Any]]:
         """(channel, stamp [ns], value) of everything, by stamp."""
-        return sorted(((channel, *pair) for channel in self.channels for pair in self[channel]), key=lambda entry: entry[1])
+        entries = [(channel, stamp_of(value), value) for channel, values in sorted(self._values.items()) for value in values]
+        return sorted(entries, key=lambda entry: entry[1])
 
     @property
     def flight(self) -> Flight:
         """As the figures are computed of, and as a recording is read."""
-        return Flight({channel: timed(self._values[channel]) for channel in self.channels})
+        return Flight({channel: timed(values) for channel, values in self._values.items() if values})
 
     @property
     def contacts(self) -> list[Contact]:
