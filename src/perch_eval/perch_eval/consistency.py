@@ -42,7 +42,7 @@ class Consistency:
         dimension: degrees of freedom of one sample.
         times: shape (m,) [s].
         mean: average over the runs at each time, shape (m,).
-        bounds: between which the average of a consistent filter lies with the given probability.
+        bounds: between which the average of a consistent filter lies with 95 % probability.
         runs: number of runs.
     """
 
@@ -64,15 +64,14 @@ class Consistency:
         return float(np.mean(self.mean > self.bounds[1]))
 
 
-def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int, probability: float = 0.95) -> Consistency:
-    """Average NEES or NIS samples over runs and set them against their bounds.
+def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int) -> Consistency:
+    """Average NEES or NIS samples over runs and set them against their 95 % bounds.
 
     Args:
         name: what was tested.
         times: shape (m,) [s].
         samples: shape (runs, m).
         dimension: degrees of freedom of one sample.
-        probability: of the bounds.
 
     Raises:
         ValueError: shapes that do not belong together.
@@ -80,12 +79,12 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int, pro
     samples = np.asarray(samples, float)
     if samples.ndim != 2 or samples.shape[1] != len(times):
         raise ValueError(f"samples of shape {samples.shape} do not fit {len(times)} times")
-    runs, tail = len(samples), 0.5 * (1 - probability)
+    runs, tail = len(samples), 0.5 * (1 - 0.95)
     low, high = chi2_quantile(np.array([tail, 1 - tail]), runs * dimension) / runs
     return Consistency(name, dimension, np.asarray(times), samples.mean(axis=0), (float(low), float(high)), runs)
 
 
-def plot(results: list[Consistency], path: Path | str, marks: dict[str, float] | None = None) -> None:
+def plot(results: list[Consistency], path: Path, marks: dict[str, float]) -> None:
     """One panel per result: the average over the runs, its expectation and bounds, into an image file.
 
     Args:
@@ -100,7 +99,7 @@ def plot(results: list[Consistency], path: Path | str, marks: dict[str, float] |
         axes.axhspan(*result.bounds, color="0.88", label="95 % bounds")
         axes.axhline(result.dimension, color="0.5", lw=0.8)
         axes.plot(result.times, result.mean, lw=1.0)
-        for name, time in (marks or {}).items():
+        for name, time in marks.items():
             axes.axvline(time, color="C3", lw=0.8, ls=":")
             axes.annotate(name, (time, 0.98), xycoords=("data", "axes fraction"), va="top", fontsize=7, color="C3")
         axes.set_title(f"{result.name}: {100 * result.inside:.0f} % of the time inside, {result.runs} runs", fontsize=9)

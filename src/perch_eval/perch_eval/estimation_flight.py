@@ -79,23 +79,21 @@ def motion_of(scenario: Scenario, seed: int) -> PerchMotion:
     return PerchMotion(settings, seed)
 
 
-def fly(scenario: Scenario, seed: int, until: float = np.inf) -> Flight:
+def fly(scenario: Scenario, seed: int) -> Flight:
     """Sensor data of a perch; calibration errors are drawn where the scenario's realism asks for them.
 
     Args:
         scenario: room, pad and realism; its target must lie straight ahead of the start.
         seed: of everything.
-        until: the flight is cut off there [s].
     """
     vehicle = load_vehicle(scenario.vehicle)
     mount, rng = vehicle.mounts["down"], np.random.default_rng([seed, 7])
     real = mount if scenario.realism == "ideal" else true_mount(mount, rng)
     motion = motion_of(scenario, seed)
-    end = min(motion.duration, until)
-    truth = motion.sample(np.arange(0.0, end - 1.5 * CONTROL_PERIOD, CONTROL_PERIOD))
+    truth = motion.sample(np.arange(0.0, motion.duration - 1.5 * CONTROL_PERIOD, CONTROL_PERIOD))
     renderer = Renderer(build_scene(scenario, seed), real, seed)
     frames = []
-    for middle in np.arange(0.02 + rng.uniform(0, 1 / mount.rate), end - 0.02, 1 / mount.rate):
+    for middle in np.arange(0.02 + rng.uniform(0, 1 / mount.rate), motion.duration - 0.02, 1 / mount.rate):
         poses = motion.sample(middle + np.linspace(-0.5, 0.5, 5) * renderer.exposure.time)
         image = renderer.render(list(zip(poses.p_WB, poses.R_WB)), np.random.default_rng([seed, round(middle * 1e6)]))
         frames.append((float(middle), round((middle + real.stamp_offset) * 1e9), image))

@@ -52,7 +52,7 @@ def fly(controller: str, condition: str, maneuver: str, seed: int) -> tuple[np.n
         order = flight.perch(place)
         end = mission.contact_due
         flight.run(min(end, flight.time + 10.0) + 1.0)
-    if order is None or not flight.flew(order):
+    if not flight.flew(order):
         return np.full(3, np.nan), f"not begun: {flight.events[-1][2]}"
     flown = flight.loop.trace.flight
     # A vehicle that has touched the wall follows no reference.

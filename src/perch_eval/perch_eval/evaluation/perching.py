@@ -73,10 +73,11 @@ def _errors(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
         for kind, values in zip(("tracking", "estimation"), paper):
             medians = []
             for axis, value in zip("xyz", values):
-                spread = Spread.of(r.metrics.get(f"{kind}_rmse_m_{axis}") for r in groups[name])
+                errors = [r.metrics.get(f"{kind}_rmse_m_{axis}") for r in groups[name]]
+                spread = Spread.of(errors)
                 medians.append(spread.median)
                 out.compare(f"{_words(name)}: {kind} {axis}", spread.words(100, 1, "cm"), f"{100 * value:.2f} cm", spread.median <= value)
-                out.data[f"{name}_{kind}_{axis}"] = [r.metrics.get(f"{kind}_rmse_m_{axis}") for r in groups[name]]
+                out.data[f"{name}_{kind}_{axis}"] = errors
             ours, theirs = math.hypot(*medians), math.hypot(*values)
             out.claim(f"{_words(name)}: {kind}, all axes", f"{100 * ours:.1f} cm", f"{100 * theirs:.1f} cm", ours <= theirs,
                       "root of the sum of squares is at most the paper's")

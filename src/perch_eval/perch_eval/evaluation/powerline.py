@@ -81,9 +81,9 @@ def flown_sections(effort: Effort) -> list[Section]:
     found = flights(effort, tuple(TABLE))
     for case, (paper_p, paper_q, *_) in TABLE.items():
         runs, name = found[case, True], WORDS[case]
-        rate = Rate.of(r.cause == SUCCESS for r in runs)
-        words = "; ".join(f"seed {r.seed}: {r.cause}: {r.message}" for r in runs if r.cause != SUCCESS)
-        out.show(f"{name}: gripped the cable", str(rate), "", words)
+        missed = [r for r in runs if r.cause != SUCCESS]
+        words = "; ".join(f"seed {r.seed}: {r.cause}: {r.message}" for r in missed)
+        out.show(f"{name}: gripped the cable", str(Rate.of(r.cause == SUCCESS for r in runs)), "", words)
         for title, key, paper, factor, unit in (("position RMSE", "perching_position_m", paper_p, 100.0, "cm"),
                                                 ("pitch-roll RMSE", "perching_tilt_deg", paper_q, 1.0, "deg")):
             values = [value for r in runs if (value := r.metrics.get(key)) is not None]
@@ -98,7 +98,6 @@ def flown_sections(effort: Effort) -> list[Section]:
         mapped = [value for r in runs if (value := r.metrics.get("mapping_m")) is not None]
         error = 100.0 * float(np.mean(mapped)) if mapped else float("nan")
         out.claim(f"{name}: mapping", f"{error:.1f} cm ({len(mapped)} maps)", "", error <= 3.0 if mapped else None, "at most 3 cm in the mean")
-        missed = [r for r in runs if r.cause != SUCCESS]
         hovering = sum(map(recovered, missed))
         out.claim(f"{name}: recoveries to a hover", f"{hovering} of {len(missed)}", "", hovering == len(missed) if missed else None, "all that did not grip")
         let_go = found[case, False]

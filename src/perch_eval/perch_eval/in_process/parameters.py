@@ -45,7 +45,11 @@ def component_class(node: str, parameters: Mapping[str, Any]) -> type[Component[
 
 
 class NodeParameters:
-    """What `config/<node>.yaml`, the scenario and its `parameters` say for each node."""
+    """What `config/<node>.yaml`, the scenario and its `parameters` say for each node.
+
+    Attributes:
+        given: node -> its parameters by dotted name.
+    """
 
     def __init__(self, scenario: Scenario, seed: int, nodes: Collection[str] = tuple(COMPONENTS)) -> None:
         """
@@ -58,7 +62,7 @@ class NodeParameters:
             ConfigError: a parameter file is none.
         """
         # The scenario may name parameters of either VIO; both are read, one is flown.
-        self._launches = {launch.name: launch for launch in node_launches(scenario, tuple(nodes), seed=seed)}
+        self.given = {launch.name: launch.parameters for launch in node_launches(scenario, tuple(nodes), seed=seed)}
 
     def of(self, node: str, cls: type[T]) -> T:
         """The parameters of a node.
@@ -66,7 +70,7 @@ class NodeParameters:
         Raises:
             ConfigError: one of them is unknown, of the wrong type, or out of range.
         """
-        return config.from_mapping(cls, config.nested(self._launches[node].parameters), node)  # type: ignore[type-var]
+        return config.from_mapping(cls, config.nested(self.given[node]), node)  # type: ignore[type-var]
 
     def component(self, node: str) -> Component[Any]:
         """The component of a node with its parameters.
@@ -74,16 +78,8 @@ class NodeParameters:
         Raises:
             ConfigError: a parameter is refused.
         """
-        cls = self.component_class(node)
+        cls = component_class(node, self.given[node])
         return cls(self.of(node, cls.config_type))
-
-    def component_class(self, node: str) -> type[Component[Any]]:
-        """The component of a node.
-
-        Raises:
-            ConfigError: there is none.
-        """
-        return component_class(node, self._launches[node].parameters)
 
 
 def check_parameters(scenario: Scenario, source: str) -> None:
@@ -95,6 +91,6 @@ def check_parameters(scenario: Scenario, source: str) -> None:
     parameters = NodeParameters(scenario, 1, scenario.parameters or ())
     for node in scenario.parameters or ():
         try:
-            parameters.of(node, parameters.component_class(node).config_type)
+            parameters.of(node, component_class(node, parameters.given[node]).config_type)
         except ConfigError as error:
             raise ConfigError(source, f"parameters.{node}.{error.key}", error.problem) from None
