@@ -41,7 +41,8 @@ def broken(effort):
     ({"a": part(False, missing=True)}, 1), ({"a": broken}, 3), ({"a": broken, "b": part(False)}, 1)])
 def test_the_exit_code_tells_failed_claims_and_missing_rows(tmp_path, monkeypatch, parts, code):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(command, "PARTS", parts)
+    monkeypatch.setattr(command, "PARTS", {name: name for name in parts})
+    monkeypatch.setattr(command, "resolved", lambda place: parts[place.rpartition(".")[2]])
     assert command.main(["--out", "results"]) == code
     page = (tmp_path / "results" / "README.md").read_text()
     content = json.loads((tmp_path / "results" / "results.json").read_text())

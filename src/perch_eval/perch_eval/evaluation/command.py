@@ -11,7 +11,7 @@ from perch_core.errors import PerchError
 from perch_core.registry import resolved
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.evaluation import document
-from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Part, Section
+from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Section
 
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       both papers, 5 seeds a condition, 1 on lines
@@ -24,18 +24,13 @@ exit code: 0 every claim holds and every row is there, 1 a claim fails, 3 no cla
 2 the caller's mistake, 130 interrupted"""
 
 
-def _part(place: str) -> Part:
-    """A part whose module is imported when it is asked for."""
-    return lambda effort: resolved(f"perch_eval.evaluation.{place}")(effort)
-
-
-PARTS: dict[str, Part] = {
-    "m_planning": _part("planning_times:planning_sections"), "m_flights": _part("perching:perching_sections"),
-    "p_powerline": _part("powerline:powerline_sections"), "p_flights": _part("powerline:flown_sections"),
-    "p_inspection": _part("inspection:inspection_sections"), "p_cable": _part("cable:cable_sections"),
-    "c_faults": _part("control:fault_sections"), "c_comparison": _part("control:comparison_sections"),
-    "c_way_out": _part("ways_out:sections"), "c_contact": _part("contact:contact_sections"),
-    "c_consistency": _part("consistency:consistency_sections")}
+PARTS = {
+    "m_planning": "planning_times:planning_sections", "m_flights": "perching:perching_sections",
+    "p_powerline": "powerline:powerline_sections", "p_flights": "powerline:flown_sections",
+    "p_inspection": "inspection:inspection_sections", "p_cable": "cable:cable_sections",
+    "c_faults": "control:fault_sections", "c_comparison": "control:comparison_sections",
+    "c_way_out": "ways_out:sections", "c_contact": "contact:contact_sections", "c_consistency": "consistency:consistency_sections"}
+"""Part -> module here and function, which makes its sections, in the order of the page."""
 FLIGHTS = {"seeds": ("flights of each perch condition", 5, 100), "line-seeds": ("flights of each powerline scenario", 1, 20),
            "layouts": ("random layouts of the inspection", 3, 20)}
 """Option -> what it counts, how many by default, and with --full."""
@@ -81,7 +76,7 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
         began = time.monotonic()
         print(f"[{k + 1}/{len(names)}] {name}", flush=True)
         try:
-            part = PARTS[name](effort)
+            part: list[Section] = resolved(f"perch_eval.evaluation.{PARTS[name]}")(effort)
         except (PerchError, ImportError, ArithmeticError, LookupError, ValueError, AttributeError, TypeError, RuntimeError) as error:
             broken = Section(name, f"{name} could not be evaluated", "")
             broken.missing(name, "", f"{type(error).__name__}: {error}")

@@ -133,16 +133,12 @@ def recovered(run: RunResult) -> bool:
 def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], list[RunResult]]:
     """Flights of each case by (case, whether the gripper works); finished ones of the same code are not flown again."""
     tasks = []
-    for number, (seed, case, grips) in enumerate(_flown(effort.seeds_on_lines, cases)):
+    jobs = [(seed, case, grips) for seed in effort.seeds_on_lines for grips in (True, False) for case in cases
+            if grips or case in WITHOUT_GRIP and seed <= SEEDS_WITHOUT_GRIP]
+    for number, (seed, case, grips) in enumerate(jobs):  # a flight keeps its number when seeds are added
         mapping: dict[str, Any] = extended_mapping("scenarios", case)
         if not grips:
             mapping["grip"] = mapping.get("grip", {}) | {"enabled": False}
         tasks.append(Task(Run(number, seed, {"scenario": case, "grips": grips}), mapping, ENGINE, RENDERED))
     found = flown(effort, "line_flights", tasks, lambda r: r.cause == SUCCESS if r.values["grips"] else recovered(r))
     return {(case, grips): [r for r in found if r.values == {"scenario": case, "grips": grips}] for case in cases for grips in (True, False)}
-
-
-def _flown(seeds: range, cases: tuple[str, ...]) -> list[tuple[int, str, bool]]:
-    """Seed, case and whether the gripper works, of every flight: a flight keeps its number when seeds are added."""
-    return [(seed, case, grips) for seed in seeds for grips in (True, False) for case in cases
-            if grips or case in WITHOUT_GRIP and seed <= SEEDS_WITHOUT_GRIP]

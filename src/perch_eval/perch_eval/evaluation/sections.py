@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -92,7 +91,3 @@ class Effort:
     seeds: range
     seeds_on_lines: range
     layouts: int
-
-
-Part = Callable[[Effort], list[Section]]
-"""A part of the evaluation: its sections, in the order of the document."""
