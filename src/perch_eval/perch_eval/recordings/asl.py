@@ -38,26 +38,22 @@ class AslRecording(Recording):
         if root is None:
             raise RecordingError(f"{path}: no mav0/cam*/data.csv")
         self._root = root
-        folders = {file.parent.name: file.parent for file in sorted(self._root.glob("cam*/data.csv"))}
+        folders = {file.parent.name: file.parent for file in sorted(root.glob("cam*/data.csv"))}
         if sensors is None and all((folder / "sensor.yaml").is_file() for folder in folders.values()):
-            sensors = from_asl(self._root)
+            sensors = from_asl(root)
         super().__init__(path, sensors)
         if sensors is not None:
             missing = sorted(set(sensors.cameras) - set(folders))
             if len(missing) == len(sensors.cameras):
-                raise RecordingError(
-                    f"{self._root}: of the cameras {', '.join(missing)} of {sensors.name} there is none, only {', '.join(folders)}")
+                raise RecordingError(f"{root}: of the cameras {', '.join(missing)} of {sensors.name} there is none, only {', '.join(folders)}")
             folders = {name: folder for name, folder in folders.items() if name in sensors.cameras}
-        self._frames = [(stamp, name, folder / "data" / file) for name, folder in folders.items()
-                        for stamp, file in _frames(folder / "data.csv")]
-        self._frames.sort(key=lambda row: row[0])
+        frames = [(stamp, name, folder / "data" / file) for name, folder in folders.items() for stamp, file in _frames(folder / "data.csv")]
+        self._frames = sorted(frames, key=lambda row: row[0])
         if not self._frames:
-            raise RecordingError(f"{self._root}: no image is named in cam*/data.csv")
+            raise RecordingError(f"{root}: no image is named in cam*/data.csv")
         self.images = {name: sum(row[1] == name for row in self._frames) for name in folders}
-        imu = self._root / "imu0" / "data.csv"
-        self._stamps, self._imu = np.empty(0, np.int64), np.empty((0, 6))
-        if imu.is_file():
-            self._stamps, self._imu = table(imu, 7)
+        imu = root / "imu0" / "data.csv"
+        self._stamps, self._imu = table(imu, 7) if imu.is_file() else (np.empty(0, np.int64), np.empty((0, 6)))
         self.samples = int((self._stamps <= self._frames[-1][0] + AFTER).sum())
 
     @property
@@ -91,11 +87,23 @@ def _frames(path: Path) -> list[tuple[int, str]]:
     return rows
 
 
+def rows_of(path: Path) -> list[str]:
+    """Lines of a file but empty ones and those that begin with #.
+
+    Raises:
+        RecordingError: it cannot be read.
+    """
+    try:
+        return [line for line in path.read_text(errors="replace").splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+
+
 def table(path: Path, columns: int) -> tuple[np.ndarray, np.ndarray]:
     """A table of numbers, separated by commas, whose first column is a stamp.
 
     Args:
-        path: of the file; lines that begin with # are not numbers.
+        path: of the file.
         columns: how many are read, with the stamp.
 
     Returns:
@@ -104,12 +112,10 @@ def table(path: Path, columns: int) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         RecordingError: it cannot be read, or is no such table.
     """
+    rows = rows_of(path)
     try:
-        rows = [line for line in path.read_text(errors="replace").splitlines() if line.strip() and not line.lstrip().startswith("#")]
         stamps = np.array([int(line.split(",", 1)[0]) for line in rows], np.int64)
         values = np.loadtxt(rows, delimiter=",", usecols=range(1, columns), ndmin=2) if rows else np.empty((0, columns - 1))
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, IndexError, OverflowError) as error:
         raise RecordingError(f"{path}: is no table of a stamp [ns] and {columns - 1} numbers: {error}") from None
     return stamps, values

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +15,11 @@ from perch_core.errors import ConfigError
 from perch_core.sensors import Sensors
 from perch_core.yaml_text import parse_yaml
 
-MODELS = {
-    "radtan": "radtan",
-    "radial-tangential": "radtan",
-    "plumb_bob": "radtan",
-    "equidistant": "equidistant",
-    "none": "pinhole",
-    "": "pinhole"
-}
+MODELS = {"radtan": "radtan", "radial-tangential": "radtan", "plumb_bob": "radtan", "equidistant": "equidistant",
+          "none": "pinhole", "": "pinhole"}
 RIGID = 1e-3  # by how much a rotation in a file may miss being one
-IMU_KEYS = {
-    "accel_noise_density": "accelerometer_noise_density",
-    "gyro_noise_density": "gyroscope_noise_density",
-    "accel_bias_walk": "accelerometer_random_walk",
-    "gyro_bias_walk": "gyroscope_random_walk"
-}
+IMU_KEYS = {"accel_noise_density": "accelerometer_noise_density", "gyro_noise_density": "gyroscope_noise_density",
+            "accel_bias_walk": "accelerometer_random_walk", "gyro_bias_walk": "gyroscope_random_walk"}
 
 
 def from_kalibr(cameras: Path, imu: Path | None, name: str, R_BI: np.ndarray = np.eye(3)) -> Sensors:
@@ -63,21 +52,17 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
     Raises:
         ConfigError: a file cannot be read, lacks something, or has a model that is not known here.
     """
-    out: dict[str, Any] = {
-        "name": re.sub(r"[^\w.+-]", "_", root.resolve().parent.name if root.name == "mav0" else root.resolve().name) or "asl",
-        "cameras": {}
-    }
+    name = root.resolve().parent.name if root.name == "mav0" else root.resolve().name
+    out: dict[str, Any] = {"name": re.sub(r"[^\w.+-]", "_", name) or "asl", "cameras": {}}
     imu = root / "imu0" / "sensor.yaml"
-    content = _mapping(imu) if imu.is_file() else {}
-    T_BI = _in_body(imu, content)
+    T_BI = in_body(imu)
     if imu.is_file():
-        out["imu"] = _imu(str(imu), content, R_BI)
+        out["imu"] = _imu(str(imu), _mapping(imu), R_BI)
     for file in sorted(root.glob("cam*/sensor.yaml")):
         c, source = _mapping(file), str(file)
         T_IC = np.linalg.inv(T_BI) @ _transform(source, "T_BS", _needed(source, c, "T_BS"))
         camera = _camera(source, "", c, c.get("distortion_coefficients", []), T_IC, R_BI)
-        camera["rate"] = c.get("rate_hz", 20)
-        out["cameras"][file.parent.name] = camera
+        out["cameras"][file.parent.name] = camera | {"rate": c.get("rate_hz", 20)}
     return config.from_mapping(Sensors, out, str(root))
 
 
@@ -87,11 +72,8 @@ def in_body(file: Path) -> np.ndarray:
     Raises:
         ConfigError: it cannot be read, or is no rigid transform.
     """
-    return _in_body(file, _mapping(file) if file.is_file() else {})
-
-
-def _in_body(file: Path, content: Mapping[str, Any]) -> np.ndarray:
-    return _transform(str(file), "T_BS", content.get("T_BS", np.eye(4).tolist()))
+    content = _mapping(file) if file.is_file() else {}
+    return _transform(str(file), "T_BS", content.get("T_BS", np.eye(4)))
 
 
 def to_yaml(sensors: Sensors, comment: str = "") -> str:
@@ -103,12 +85,8 @@ def to_yaml(sensors: Sensors, comment: str = "") -> str:
 def _plain(value: Any) -> Any:
     """Dataclasses as mappings without their defaults, tuples as lists."""
     if dataclasses.is_dataclass(value):
-        pairs = {f.name: (getattr(value, f.name), f) for f in dataclasses.fields(value)}
-        return {
-            key: _plain(item)
-            for key, (item, f) in pairs.items()
-            if item != f.default and (f.default_factory is dataclasses.MISSING or item != f.default_factory())
-        }
+        return {f.name: _plain(item) for f in dataclasses.fields(value) if (item := getattr(value, f.name)) != f.default
+                and (f.default_factory is dataclasses.MISSING or item != f.default_factory())}
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
@@ -125,9 +103,7 @@ def _kalibr_camera(source: str, key: str, c: Any, R_BI: np.ndarray) -> dict[str,
     shift = _number(source, f"{key}.timeshift_cam_imu", c.get("timeshift_cam_imu", 0.0))
     if abs(shift) > 0.5:
         raise ConfigError(source, f"{key}.timeshift_cam_imu", f"{shift:g} s is outside [-0.5, 0.5] s")
-    out["stamp_offset"] = -shift
-    out["topic"] = str(c.get("rostopic", ""))
-    return out
+    return out | {"stamp_offset": -shift, "topic": str(c.get("rostopic", ""))}
 
 
 def _camera(source: str, dot: str, c: dict[str, Any], distortion: Any, T_IC: np.ndarray, R_BI: np.ndarray) -> dict[str, Any]:
@@ -143,26 +119,17 @@ def _camera(source: str, dot: str, c: dict[str, Any], distortion: Any, T_IC: np.
         if not isinstance(value, list) or len(value) != n:
             raise ConfigError(source, f"{dot}{key}", f"{value!r} is not {n} numbers")
     R_BC, p_BC = R_BI @ T_IC[:3, :3], R_BI @ T_IC[:3, 3]
-    return {
-        "model": MODELS[model],
-        "width": resolution[0],
-        "height": resolution[1],
-        "focal": intrinsics[:2],
-        "centre": intrinsics[2:],
-        "distortion": distortion if MODELS[model] != "pinhole" else [],
-        "position": p_BC.tolist(),
-        "orientation": so3.quat_from_matrix(R_BC).tolist()
-    }
+    return {"model": MODELS[model], "width": resolution[0], "height": resolution[1], "focal": intrinsics[:2], "centre": intrinsics[2:],
+            "distortion": distortion if MODELS[model] != "pinhole" else [], "position": p_BC.tolist(),
+            "orientation": so3.quat_from_matrix(R_BC).tolist()}
 
 
 def _imu(source: str, c: Any, R_BI: np.ndarray) -> dict[str, Any]:
     if not isinstance(c, dict):
         raise ConfigError(source, "", "is no mapping")
     out: dict[str, Any] = {ours: _number(source, theirs, _needed(source, c, theirs)) for ours, theirs in IMU_KEYS.items()}
-    out["rate"] = _number(source, "update_rate", c.get("update_rate", c.get("rate_hz")))
-    out["orientation"] = so3.quat_from_matrix(R_BI).tolist()
-    out["topic"] = str(c.get("rostopic", ""))
-    return out
+    return out | {"rate": _number(source, "update_rate", c.get("update_rate", c.get("rate_hz"))),
+                  "orientation": so3.quat_from_matrix(R_BI).tolist(), "topic": str(c.get("rostopic", ""))}
 
 
 def _mapping(path: Path) -> dict[str, Any]:
@@ -197,8 +164,8 @@ def _transform(source: str, key: str, value: Any) -> np.ndarray:
     except (KeyError, TypeError, ValueError):
         raise ConfigError(source, key, "is not 4 x 4 numbers") from None
     R = T[:3, :3]
-    if not np.isfinite(T).all() or np.abs(R @ R.T
-                                          - np.eye(3)).max() > RIGID or np.linalg.det(R) < 0.0 or not np.allclose(T[3], [0, 0, 0, 1]):
+    rotation = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() <= RIGID and np.linalg.det(R) >= 0.0
+    if not rotation or not np.allclose(T[3], [0, 0, 0, 1]):
         raise ConfigError(source, key, f"{np.round(T, 4).tolist()} is no rigid transform")
     T[:3, :3] = so3.nearest(R)
     return T

@@ -82,22 +82,18 @@ def check_camera(report: Report, name: str, looker: Looker, imu_stamps: np.ndarr
         outside = float(((stamps < imu_stamps[0]) | (stamps > imu_stamps[-1])).mean())
         if outside > 0.02:
             gap = 1e-9 * max(imu_stamps[0] - stamps[0], stamps[-1] - imu_stamps[-1])
-            report.say(f"{about} clock",
-                       f"{100 * outside:.0f} % of the images lie outside the IMU's time, by up to {gap:.3f} s",
-                       warning=outside < 0.5,
-                       fails=outside >= 0.5)
+            report.say(f"{about} clock", f"{100 * outside:.0f} % of the images lie outside the IMU's time, by up to {gap:.3f} s",
+                       warning=outside < 0.5, fails=outside >= 0.5)
         delays = 1e-9 * np.array(looker.delays)
         if np.any(delays != 0.0):
-            report.say(
-                f"{about} delay",
-                f"recorded {1e3 * np.median(delays):.0f} ms after the stamp (median; 99 % within {1e3 * np.percentile(delays, 99):.0f} ms)",
-                warning=bool(np.median(delays) < -1e-3 or np.percentile(delays, 99) > 0.5))
+            median, p99 = float(np.median(delays)), float(np.percentile(delays, 99))
+            report.say(f"{about} delay", f"recorded {1e3 * median:.0f} ms after the stamp (median; 99 % within {1e3 * p99:.0f} ms)",
+                       warning=median < -1e-3 or p99 > 0.5)
     brightness, bright, width, corners = (np.array(column) for column in zip(*looker.looks))
     report.figures[f"{name}_corners"] = float(np.median(corners))
     report.say(f"{about} exposure",
                f"mean brightness {np.median(brightness):.0f} of 255, {100 * np.median(bright):.1f} % of the pixels saturated",
-               warning=bool(np.median(brightness) < 25 or np.median(bright) > 0.2),
-               fails=bool(np.median(brightness) < 5))
+               warning=bool(np.median(brightness) < 25 or np.median(bright) > 0.2), fails=bool(np.median(brightness) < 5))
     if np.isfinite(width).any():
         worst, blurred = float(np.nanpercentile(width, 90)), float(np.nanmedian(width))
         report.figures[f"{name}_edge_px"] = blurred
@@ -108,8 +104,7 @@ def check_camera(report: Report, name: str, looker: Looker, imu_stamps: np.ndarr
     few = float((corners < 30).mean())
     report.say(f"{about} texture",
                f"{np.median(corners):.0f} corners in the median" + (f"; under 30 in {100 * few:.0f} % of the images" if few else ""),
-               warning=few > 0.1,
-               fails=few > 0.8)
+               warning=few > 0.1, fails=few > 0.8)
 
 
 def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: np.ndarray, sensors: Sensors, R_BI: np.ndarray) -> None:
@@ -153,8 +148,7 @@ def _check_clock(report: Report, name: str, turns: np.ndarray, stamps: np.ndarra
     report.say(f"camera {name} clock",
                f"stamps are {'more than ' if edge else ''}{1e3 * offset:+.0f} ms ({1e3 * sigma:.0f} ms, 1 sigma) from the IMU's clock by "
                f"the turns that both see, {1e3 * told:+.0f} ms in the sensor file",
-               warning=beyond > 0.005,
-               fails=edge or beyond > 0.02)
+               warning=beyond > 0.005, fails=edge or beyond > 0.02)
 
 
 def _liveliest(stamps: np.ndarray, gyro: np.ndarray) -> int:

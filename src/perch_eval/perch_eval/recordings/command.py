@@ -3,35 +3,30 @@
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from perch_core import so3
 from perch_core.errors import ConfigError, PerchError
-from perch_core.json_values import finite
 from perch_core.processes import one_thread_for_sums
 from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
 from perch_core.values import CameraImage, InertialState, OdometryState
 from perch_eval.arguments import command, command_parser, output_folder
 from perch_eval.node_launch import parse_overrides
-from perch_eval.recordings import report
 from perch_eval.recordings.calibration import to_yaml
 from perch_eval.recordings.check import check
 from perch_eval.recordings.evaluation import Evaluation, evaluate
-from perch_eval.recordings.findings import Finding
-from perch_eval.recordings.drawing import Gallery, Shown
+from perch_eval.recordings.drawing import Gallery
 from perch_eval.recordings.opening import open_recording
-from perch_eval.recordings.perception import Choice, Perception
+from perch_eval.recordings.perception import Perception
 from perch_eval.recordings.pictures_seen import drawn, guessed_mount, look
 from perch_eval.recordings.recording import Recording, RecordingError
+from perch_eval.recordings.report import Told, bias_figure, error_figure, frames_figure, path_figure, write_json
 from perch_eval.recordings.trajectory import Trajectory, read_truth, write_tum
 from perch_perception.images import ImageError
 from perch_perception.line_mapping import LineDetectionConfig
@@ -56,7 +51,8 @@ def parser() -> argparse.ArgumentParser:
                      help="rosbag2 folder, .mcap, .db3, ROS 1 .bag, EuRoC or TUM-VI folder, images")
     out.add_argument("--sensors", metavar="FILE",
                      help="sensor file, or its name in config/sensors (default: the recording's own calibration)")
-    out.add_argument("--truth", metavar="FILE", help="true motion of the IMU's axes: TUM or EuRoC file, or a topic of the bag (default: the recording's own)")
+    out.add_argument("--truth", metavar="FILE",
+                     help="true motion of the IMU's axes: TUM or EuRoC file, or a topic of the bag (default: the recording's own)")
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     out.add_argument("--camera", metavar="NAME", help="camera of VIO (default: down, or the first)")
     out.add_argument("--front", metavar="NAME", help="camera of target localiser and powerline mapper (default: front, or that of VIO)")
@@ -99,31 +95,6 @@ def _choose(sensors: Sensors, recording: Recording, given: str | None, preferred
     return given or (preferred if preferred in there else there[0])
 
 
-@dataclass
-class Told:
-    """What is told of a recording: figures for JSON, rows of words, plots and pictures by title."""
-
-    figures: dict[str, Any]
-    rows: list[tuple[str, str]]
-    plots: dict[str, Figure] = field(default_factory=dict)
-    pictures: dict[str, Sequence[Shown]] = field(default_factory=dict)
-
-    def write(self, folder: Path, recording: Recording, findings: Sequence[Finding] = (), log: Mapping[tuple[str, str, str], int] | None = None) -> None:
-        """Into `report.json` and `report.html`, and to the terminal."""
-        _write_json(folder / "report.json", self.figures)
-        page = report.page(recording.path.name, self.rows, findings, self.plots, self.pictures, log or {})
-        (folder / "report.html").write_text(page)
-        print("\n".join(f"{name}: {text}" for name, text in self.rows))
-        for finding in findings:
-            if finding.level != "ok":
-                print(f"{finding.level}: {finding.about}: {finding.text}")
-        print(f"report: {folder / 'report.html'}")
-
-
-def _write_json(file: Path, content: Any) -> None:
-    file.write_text(json.dumps(finite(content), indent=1) + "\n")
-
-
 # -- recordings with an IMU ------------------------------------------------------------------------------------------
 
 
@@ -133,7 +104,7 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
     front = _choose(sensors, recording, args.front, "front", "--front") if args.front or "front" in recording.images else down
     file = args.out / "sensors.yaml"  # what was used, beside what came of it
     file.write_text(to_yaml(sensors, f"of {recording.path.name}"))
-    perception = Perception(sensors, Choice(str(file), down, front, args.board, overrides, tuple(args.without)))
+    perception = Perception(sensors, str(file), down, front, args.board, overrides, args.without)
     for event in recording.read():
         perception.take(event)
     checked, vio = check(recording), _trajectory(perception.states)
@@ -148,7 +119,7 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
         told.rows.append(("damage", recording.damage))
     if perception.wires is not None:
         lines = perception.lines.lines if perception.lines is not None else ()
-        _write_json(args.out / "powerlines.json", [
+        write_json(args.out / "powerlines.json", [
             {"id": line.id, "start": list(line.start), "end": list(line.end), "radius": line.radius,
              "covariance": line.covariance.tolist(), "observations": line.observations} for line in lines])
     targets = Trajectory.of((target.stamp, target.p_WS, target.q_WS) for target in perception.targets)
@@ -184,13 +155,13 @@ def _tell_motion(told: Told, perception: Perception, vio: Trajectory, truth: Tra
                 told.rows += _evaluation_rows("estimator", against)[:2]
             except RecordingError as error:
                 told.rows.append(("not compared", str(error)))
-        told.plots["The path"] = report.path_figure(vio, compared)
+        told.plots["The path"] = path_figure(vio, compared)
         if compared is not None:
             index = {s.stamp: np.sqrt(np.diag(s.covariance)[:3]) for s in states}
-            told.plots["Error and covariance"] = report.error_figure(compared, np.array([index[stamp] for stamp in compared.stamps.tolist()]))
-        told.plots["Biases"] = report.bias_figure(perception)
+            told.plots["Error and covariance"] = error_figure(compared, np.array([index[stamp] for stamp in compared.stamps.tolist()]))
+        told.plots["Biases"] = bias_figure(perception)
     if frames:
-        told.plots["Tracks over time"] = report.frames_figure(frames)
+        told.plots["Tracks over time"] = frames_figure(frames)
     told.pictures["Tracks"] = perception.vio.gallery.shown
 
 
@@ -268,7 +239,7 @@ def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
             ("images", f"{len(seen)}" + ("" if recording.sensors else "; the camera is not calibrated")), ("tags", str(tags)),
             ("board", f"posed in {poses}"), ("wires", str(sum(len(s["wires"]) for s in seen.values())))]
     rows += [("problem", problem) for problem in problems]
-    _write_json(args.out / "detections.json", seen)
+    write_json(args.out / "detections.json", seen)
     figures = {"images": len(seen), "tags": tags, "boards": poses, "problems": problems}
     Told(figures, rows, pictures={"What was found": gallery.shown}).write(args.out, recording)
     return 0 if seen else 1

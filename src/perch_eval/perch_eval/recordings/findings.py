@@ -37,8 +37,8 @@ class Report:
         return any(finding.level == FAILS for finding in self.findings)
 
 
-def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, wanted: float, told: float | None) -> tuple[float, float]:
-    """Rate [Hz] and jitter (1 sigma of an interval, in periods) of ascending stamps, three or more."""
+def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, wanted: float, told: float | None) -> float:
+    """Judge the rate, the jitter (1 sigma of an interval, in periods) and the gaps of ascending stamps, three or more; the rate [Hz]."""
     intervals = 1e-9 * np.diff(stamps)
     reach = min(9, len(intervals))  # stamps may come in batches
     period = float(np.median(stamps[reach:] - stamps[:-reach])) * 1e-9 / reach
@@ -51,15 +51,13 @@ def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, w
                f"{rate:.1f} Hz over {1e-9 * (stamps[-1] - stamps[0]):.1f} s" + (f", {told:g} Hz in the sensor file" if wrong else "") +
                (f": at least {wanted:g} Hz are wanted" if rate < wanted else "") +
                (": stamps are not in nanoseconds" if rate > MOST else ""),
-               warning=rate < wanted or wrong,
-               fails=not least <= rate <= MOST)
+               warning=rate < wanted or wrong, fails=not least <= rate <= MOST)
     report.say(f"{about} jitter",
                f"{1e3 * jitter * period:.2f} ms (1 sigma), {100 * jitter:.0f} % of the period" +
                (": stamps are taken on arrival, or in batches; stamp where the sensor is sampled" if jitter > 0.1 else ""),
                warning=jitter > 0.1)
     if len(gaps):
         lost = round(float((gaps / period - 1.0).sum()))
-        report.say(f"{about} gaps",
-                   f"{len(gaps)}, the longest {1e3 * gaps.max():.0f} ms; {lost} missing ({100 * lost / (len(stamps) + lost):.1f} %)",
-                   warning=True)
-    return rate, jitter
+        share = 100 * lost / (len(stamps) + lost)
+        report.say(f"{about} gaps", f"{len(gaps)}, the longest {1e3 * gaps.max():.0f} ms; {lost} missing ({share:.1f} %)", warning=True)
+    return rate

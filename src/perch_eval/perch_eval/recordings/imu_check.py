@@ -22,7 +22,7 @@ def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSe
     if len(stamps) < 3:
         report.say("imu stamps", "all are the same: the driver does not stamp", fails=True)
         return
-    rate, jitter = check_rhythm(report, "imu", stamps, least=50.0, wanted=100.0, told=sensor.rate if sensor else None)
+    rate = check_rhythm(report, "imu", stamps, least=50.0, wanted=100.0, told=sensor.rate if sensor else None)
     if not np.isfinite(imu).all():
         report.say("imu values", "some are not finite", fails=True)
         imu = np.nan_to_num(imu)
@@ -68,29 +68,17 @@ def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor
     tau, deviation = allan_deviation(imu, rate)
     short = tau <= max(0.2, tau[0])  # where white noise has the say
     white = np.median(deviation[short] * np.sqrt(tau[short])[:, None], axis=0)
-    density = {"gyro": float(white[:3].max()), "accel": float(white[3:].max())}
-    report.figures |= {
-        "gyro_noise_density": density["gyro"],
-        "accel_noise_density": density["accel"],
-        "allan_tau_s": tau.tolist(),
-        "allan_gyro": deviation[:, :3].max(axis=1).tolist(),
-        "allan_accel": deviation[:, 3:].max(axis=1).tolist()
-    }
+    gyro, accel = deviation[:, :3].max(axis=1), deviation[:, 3:].max(axis=1)
+    densities = {"gyro": float(white[:3].max()), "accel": float(white[3:].max())}
+    report.figures |= {"gyro_noise_density": densities["gyro"], "accel_noise_density": densities["accel"], "allan_tau_s": tau.tolist(),
+                       "allan_gyro": gyro.tolist(), "allan_accel": accel.tolist()}
     if tau[-1] >= 5.0:
-        report.say(
-            "bias stability",
-            f"gyro {deviation[:, :3].max(axis=1).min():.1e} rad/s, accelerometer {deviation[:, 3:].max(axis=1).min():.1e} "
-            "m/s^2 (least Allan deviation)")
+        report.say("bias stability", f"gyro {gyro.min():.1e} rad/s, accelerometer {accel.min():.1e} m/s^2 (least Allan deviation)")
     for name, unit in (("gyro", "rad/s/sqrt(Hz)"), ("accel", "m/s^2/sqrt(Hz)")):
-        text = f"{density[name]:.1e} {unit} at rest"
-        if sensor is None:
-            report.say(f"{name} noise", text)
-            continue
-        told = getattr(sensor, f"{name}_noise_density")
-        report.say(f"{name} noise",
-                   f"{text}, {told:.1e} in the sensor file" +
-                   (": the filter will trust the sensor too much" if density[name] > 2.0 * told else ""),
-                   warning=density[name] > 2.0 * told)
+        told = getattr(sensor, f"{name}_noise_density") if sensor is not None else np.inf
+        more = densities[name] > 2.0 * told
+        report.say(f"{name} noise", f"{densities[name]:.1e} {unit} at rest" + (f", {told:.1e} in the sensor file" if sensor is not None else "")
+                   + (": the filter will trust the sensor too much" if more else ""), warning=more)
 
 
 def stretches_at_rest(stamps: np.ndarray, imu: np.ndarray) -> list[tuple[int, int]]:

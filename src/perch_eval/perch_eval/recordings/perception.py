@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,27 +28,6 @@ from perch_perception.vio_component import VioComponent
 
 KNOWN = 100.0  # 1 sigma of a position that means something [m]
 TAIL = 8  # frames that a picture of tracks looks back
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Who looks through which camera, and at what.
-
-    Attributes:
-        sensors: name or file of the sensors.
-        down: camera of VIO.
-        front: camera of target localiser and powerline mapper.
-        board: tag board, config/boards/<name>.yaml or a file.
-        overrides: node -> parameter -> value, over `config/<node>.yaml`.
-        without: nodes that are left out.
-    """
-
-    sensors: str
-    down: str
-    front: str
-    board: str
-    overrides: Mapping[str, Mapping[str, Any]]
-    without: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -99,16 +78,14 @@ class _Vio(VioComponent):
 class _Target(TargetLocalizer):
     """Draws some of the images in which it finds the board, and a few in which it does not."""
 
+    sightings: list[TargetSighting]
     found: Gallery
     missed: Gallery
 
     def look(self, image: CameraImage, exposed: float) -> None:
         """As it does."""
-        sightings: list[TargetSighting] = []
-        self.sighting.receivers.append(sightings.append)
         super().look(image, exposed)
-        self.sighting.receivers.pop()
-        seen = sightings[-1]
+        seen = self.sightings[-1]
         (self.missed if seen.pose_camera is None else self.found).offer(lambda: self._drawn(image, seen))
 
     def _drawn(self, image: CameraImage, seen: TargetSighting) -> Shown | None:
@@ -156,20 +133,31 @@ class Perception:
         lines: the last map; None: there is none.
         log: (node, level, text), each text once.
     """
-    def __init__(self, sensors: Sensors, choice: Choice) -> None:
+
+    def __init__(self, sensors: Sensors, file: str, down: str, front: str, board: str, overrides: Mapping[str, Mapping[str, Any]],
+                 without: Collection[str] = ()) -> None:
         """
+        Args:
+            sensors, file: cameras and IMU, and the file that describes them.
+            down: camera of VIO.
+            front: camera of target localiser and powerline mapper.
+            board: tag board, config/boards/<name>.yaml or a file.
+            overrides: node -> parameter -> value, over `config/<node>.yaml`.
+            without: nodes that are left out.
+
         Raises:
             ConfigError: a parameter or a camera is refused.
         """
-        self._sensors, self._choice = sensors, choice
-        common = {"sensors": choice.sensors}
-        down, front = common | {"camera": choice.down}, common | {"camera": choice.front}
-        wires = "red" if sensors.cameras[choice.front].colour else "plain"
-        self.vio: _Vio = self._make("vio", _Vio, down | {"level_ground": False})
+        self._sensors, self._overrides, self._without = sensors, overrides, without
+        common = {"sensors": file}
+        ahead = common | {"camera": front}
+        wires = "red" if sensors.cameras[front].colour else "plain"
+        self.vio: _Vio = self._make("vio", _Vio, common | {"camera": down, "level_ground": False})
         self.vio.frames, self.vio.gallery = [], Gallery()
         self.estimator: StateEstimator = self._make("estimator", StateEstimator, common)
-        self.target: _Target | None = self._make("target_localizer", _Target, front | {"board": choice.board})
-        self.wires: _Wires | None = self._make("powerline_mapper", _Wires, front | {"detection.appearance": wires})
+        self.target: _Target | None = self._make("target_localizer", _Target, ahead | {"board": board})
+        self.wires: _Wires | None = self._make("powerline_mapper", _Wires, ahead | {"detection.appearance": wires})
+        self._looking: list[tuple[str, CameraComponent[Any] | None]] = [(down, self.vio), (front, self.target), (front, self.wires)]
         self.states: list[InertialState] = []
         self.odometry: list[OdometryState] = []
         self.health: list[EstimatorHealth] = []
@@ -182,7 +170,7 @@ class Perception:
         self.estimator.status.receivers.append(self.health.append)
         self.estimator.odometry.receivers.append(self._keep)
         if self.target is not None:
-            self.target.found, self.target.missed = Gallery(), Gallery(4)
+            self.target.sightings, self.target.found, self.target.missed = self.sightings, Gallery(), Gallery(4)
             self.target.sighting.receivers.append(self.sightings.append)
             self.target.pose.receivers.append(self.targets.append)
             self.estimator.odometry.receivers.append(self.target.on_odometry)
@@ -198,18 +186,16 @@ class Perception:
             self.estimator.on_imu(value)
             self.vio.on_imu(value)
             return
-        looking: list[tuple[str, CameraComponent[Any] | None]] = [
-            (self._choice.down, self.vio), (self._choice.front, self.target), (self._choice.front, self.wires)]
-        for camera, component in looking:
+        for camera, component in self._looking:
             if component is not None and camera == event.source:
                 component.on_camera_info(CameraModel(value.stamp, value.frame, self._sensors.cameras[camera].camera))
                 component.on_image(value)
 
     def _make(self, node: str, cls: type[Component[Any]], given: Mapping[str, Any]) -> Any:
         """A component with the parameters of its node; None where it is left out."""
-        if node in self._choice.without:
+        if node in self._without:
             return None
-        parameters = config.flattened(read_parameters(node)) | dict(given) | config.flattened(self._choice.overrides.get(node, {}))
+        parameters = config.flattened(read_parameters(node)) | dict(given) | config.flattened(self._overrides.get(node, {}))
         component = cls(config.from_mapping(cls.config_type, config.nested(parameters), node))
         component.log.receivers.append(lambda line: self._note(node, line))
         return component

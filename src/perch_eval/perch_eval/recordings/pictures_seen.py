@@ -16,7 +16,7 @@ from perch_core.values import CameraImage, TargetPose
 from perch_eval.recordings.drawing import Shown, canvas, caption, draw_board, draw_tags, draw_wires
 from perch_perception.images import mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineSighting, detect_lines
-from perch_perception.tags import BoardLocalizer, BoardPose, TagDetector, refine_corners
+from perch_perception.tags import BoardLocalizer, BoardPose, Localization, TagDetector, refine_corners
 
 GUESSED_FOCAL = 0.8  # of a camera that nobody has calibrated, as a share of the image's width
 
@@ -41,25 +41,13 @@ class Seen:
 
     def figures(self) -> dict[str, Any]:
         """For JSON: lengths in m, angles as quaternions xyzw, pixels as OpenCV counts them."""
+        pixels = [np.round(self.mount.camera.project(wire.rays_C)[0], 2).tolist() for wire in self.wires]
         out: dict[str, Any] = {
-            "tags": [{
-                "id": number,
-                "corners": np.round(corners, 3).tolist()
-            } for number, corners in self.tags],
-            "message": self.message,
-            "wires": [{
-                "pixels": np.round(self.mount.camera.project(wire.rays_C)[0], 2).tolist(),
-                "length_px": round(wire.length, 1)
-            } for wire in self.wires]
-        }
-        if self.board is not None:
-            out["board"] = {
-                "position": self.board.p_CS.tolist(),
-                "orientation": so3.quat_from_matrix(self.board.R_CS).tolist(),
-                "sigma": np.sqrt(np.diag(self.board.covariance)).tolist(),
-                "rms_px": self.board.rms,
-                "ids": list(self.board.ids)
-            }
+            "tags": [{"id": number, "corners": np.round(corners, 3).tolist()} for number, corners in self.tags], "message": self.message,
+            "wires": [{"pixels": arc, "length_px": round(wire.length, 1)} for arc, wire in zip(pixels, self.wires)]}
+        if (b := self.board) is not None:
+            out["board"] = {"position": b.p_CS.tolist(), "orientation": so3.quat_from_matrix(b.R_CS).tolist(),
+                            "sigma": np.sqrt(np.diag(b.covariance)).tolist(), "rms_px": b.rms, "ids": list(b.ids)}
         return out
 
 
@@ -84,13 +72,9 @@ def look(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDet
     """
     grey = mono_image(image, mount.camera)
     tags = find_tags(grey, mount.camera, board)
-    if calibrated:
-        found = BoardLocalizer(board, mount).process(grey, 0.0)
-        pose, message = found.board, found.message
-    else:
-        pose, message = None, "the camera is not calibrated: no pose"
+    found = BoardLocalizer(board, mount).process(grey, 0.0) if calibrated else Localization(None, message="the camera is not calibrated: no pose")
     pixels = rgb_image(image, mount.camera) if wires.appearance == "red" else grey
-    return Seen(tags, pose, message, detect_lines(pixels, mount.camera, wires), mount)
+    return Seen(tags, found.board, found.message, detect_lines(pixels, mount.camera, wires), mount)
 
 
 def find_tags(grey: np.ndarray, camera: Camera, board: TagBoard) -> list[tuple[int, np.ndarray]]:

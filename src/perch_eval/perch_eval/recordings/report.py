@@ -1,48 +1,58 @@
-"""`report.html` of a recording: what was found, how far off it was, and what it looked like."""
+"""`report.html` and `report.json` of a recording: what was found, how far off it was, and what it looked like."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from perch_eval.page import image, images, section, table
-from perch_eval.page import page as document
+from perch_core.json_values import finite
+from perch_eval.page import image, images, page, section, table
 from perch_eval.recordings.findings import Finding
 from perch_eval.recordings.evaluation import Evaluation
 from perch_eval.recordings.drawing import Shown
 from perch_eval.recordings.perception import Frame, Perception
+from perch_eval.recordings.recording import Recording
 from perch_eval.recordings.trajectory import Trajectory
 
-COLOURS = {
-    "TRACKING": "#2ca02c",
-    "RESTING": "#1f77b4",
-    "LEAVING": "#17becf",
-    "BLIND": "#d62728",
-    "LOST": "#8c564b",
-    "INITIALISING": "#bbbbbb"
-}
+COLOURS = {"TRACKING": "#2ca02c", "RESTING": "#1f77b4", "LEAVING": "#17becf", "BLIND": "#d62728", "LOST": "#8c564b",
+           "INITIALISING": "#bbbbbb"}
 
 
-def page(title: str, summary: Sequence[tuple[str, str]], findings: Sequence[Finding], figures: Mapping[str, Figure],
-         pictures: Mapping[str, Sequence[Shown]], log: Mapping[tuple[str, str, str], int]) -> str:
-    """The page.
+@dataclass
+class Told:
+    """What is told of a recording: figures for JSON, rows of words, plots and pictures by title."""
 
-    Args:
-        title: of the recording.
-        summary: rows of the first table: name and figure.
-        findings: of the check.
-        figures: title -> figure.
-        pictures: title -> pictures.
-        log: (node, level, text) -> how often.
-    """
-    sensors = table(((f.level, f.about, f.text) for f in findings), classes=[f.level for f in findings])
-    lines = ((f"{node}: {level}", message, f"{n} times" if n > 1 else "") for (node, level, message), n in log.items())
-    return document(title, table(summary), *(section(name, image(figure, name)) for name, figure in figures.items()),
-                    *(section(name, images((f"{1e-9 * one.stamp:.3f} s: {one.caption}", one.pixels) for one in shown))
-                      for name, shown in pictures.items()),
-                    section("The sensors", sensors), section("Log of the components", table(lines)))
+    figures: dict[str, Any]
+    rows: list[tuple[str, str]]
+    plots: dict[str, Figure] = field(default_factory=dict)
+    pictures: dict[str, Sequence[Shown]] = field(default_factory=dict)
+
+    def write(self, folder: Path, recording: Recording, findings: Sequence[Finding] = (), log: Mapping[tuple[str, str, str], int] = {}) -> None:
+        """Into `report.json` and `report.html`, and to the terminal; with the findings of the check, and (node, level, text) -> how often."""
+        write_json(folder / "report.json", self.figures)
+        lines = ((f"{node}: {level}", message, f"{n} times" if n > 1 else "") for (node, level, message), n in log.items())
+        (folder / "report.html").write_text(page(
+            recording.path.name, table(self.rows), *(section(name, image(figure, name)) for name, figure in self.plots.items()),
+            *(section(name, images((f"{1e-9 * one.stamp:.3f} s: {one.caption}", one.pixels) for one in shown))
+              for name, shown in self.pictures.items()),
+            section("The sensors", table(((f.level, f.about, f.text) for f in findings), classes=[f.level for f in findings])),
+            section("Log of the components", table(lines))))
+        print("\n".join(f"{name}: {text}" for name, text in self.rows))
+        for finding in findings:
+            if finding.level != "ok":
+                print(f"{finding.level}: {finding.about}: {finding.text}")
+        print(f"report: {folder / 'report.html'}")
+
+
+def write_json(file: Path, content: Any) -> None:
+    """Without nan and infinities, which are null."""
+    file.write_text(json.dumps(finite(content), indent=1) + "\n")
 
 
 def path_figure(estimate: Trajectory, evaluation: Evaluation | None) -> Figure:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from perch_core import so3
 from perch_core.errors import ConfigError
-from perch_core.sensors import load_sensors
+from perch_core.sensors import Sensors, load_sensors
 from perch_eval.arguments import command, command_parser
 from perch_eval.recordings.asl import root_of
 from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
@@ -75,10 +76,8 @@ def _import(args: argparse.Namespace) -> int:
     return 0
 
 
-def _renamed(sensors, args: argparse.Namespace):
+def _renamed(sensors: Sensors, args: argparse.Namespace) -> Sensors:
     """The sensors with the names that are wanted."""
-    from dataclasses import replace
-
     names = dict(pair.split("=", 1) if "=" in pair else (pair, "") for pair in args.rename)
     for old, new in names.items():
         if old not in sensors.cameras or not new.isidentifier():

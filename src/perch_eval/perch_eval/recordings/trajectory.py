@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from perch_core import so3
-from perch_eval.recordings.asl import table
+from perch_eval.recordings.asl import rows_of, table
 from perch_eval.recordings.bag import BagRecording
 from perch_eval.recordings.calibration import in_body
 from perch_eval.recordings.recording import Recording, RecordingError
@@ -108,8 +108,7 @@ def read_truth(recording: Recording, given: str | None) -> Trajectory | None:
         return read_trajectory(Path(given))
     if isinstance(recording, BagRecording) and given.startswith("/"):
         rows = recording.poses(given)
-        stamps = np.array([row[0] for row in rows], np.int64)
-        return _checked(f"{recording.path}: {given}", stamps, np.array([row[1:] for row in rows], float))
+        return _checked(f"{recording.path}: {given}", np.array([row[0] for row in rows], np.int64), np.array([row[1:] for row in rows], float))
     raise RecordingError(f"--truth {given}: is no file{', and no topic' if isinstance(recording, BagRecording) else ''}")
 
 
@@ -119,16 +118,13 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises:
         RecordingError: it cannot be read, or is neither.
     """
-    try:
-        first = next((line for line in path.read_text(errors="replace").splitlines() if line.strip() and line.lstrip()[0] not in "#"), "")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-    if "," in first:
+    lines = rows_of(path)
+    if lines and "," in lines[0]:
         stamps, values = table(path, 8)
         values = values[:, [0, 1, 2, 4, 5, 6, 3]]
     else:
+        rows = [line.split() for line in lines]
         try:
-            rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.lstrip().startswith("#")]
             stamps = np.array([_nanoseconds(row[0]) for row in rows], np.int64)
             values = np.array([row[1:8] for row in rows], float)
         except (ValueError, IndexError, ArithmeticError):
