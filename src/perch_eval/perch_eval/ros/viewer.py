@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from perch_core.component import Output
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
 from perch_core.ros import topics
-from perch_core.values import NANOSECONDS, AtEnd, CameraImage, Marker, Markers, Serialized
+from perch_core.values import NANOSECONDS, AtEnd, CameraImage, Marker, Markers, OdometryState, Serialized
 from perch_core.vehicle import load_vehicle
 from perch_eval.extras import require
 from perch_eval.ros.definitions import schema_of
@@ -87,9 +86,6 @@ class Viewer(Listener[ViewerParameters]):
         self._scene_pace, self._scenes = _Pace(SCENE_RATE), 0
         self._paces = {channel: _Pace(RATE) for channel in FAST}
         self._image_paces = {camera: _Pace(IMAGE_RATE) for camera in CAMERAS}
-        self._looks: dict[str, Callable[[bytes, int], None]] = {
-            "odometry": self._see_odometry, "ground_truth/odometry": self._see_truth, "trajectory": self._see_trajectory,
-            "target/pose": self._see_target, "powerlines": self._see_lines, "controller/status": self._see_status}
         require("view")
         from perch_eval.view.server import LiveServer
 
@@ -105,12 +101,10 @@ class Viewer(Listener[ViewerParameters]):
         pace = self._paces.get(channel)
         if pace is None or pace(message.stamp):
             self._send(message, KEPT.get(channel, channel in RARE))
-        look = self._looks.get(channel)
-        if look is not None:
-            try:
-                look(message.data, message.stamp)
-            except PerchError as error:
-                self.warn(f"{channel} is not drawn: {error}", every=1.0)
+        try:
+            self._see(channel, message)
+        except PerchError as error:
+            self.warn(f"{channel} is not drawn: {error}", every=1.0)
 
     def on_image(self, camera: str, image: CameraImage) -> None:
         """Pass an image on while somebody looks."""
@@ -135,31 +129,27 @@ class Viewer(Listener[ViewerParameters]):
         self._declare(message.topic, message.message)
         self.server.send(message.topic, message.data, message.stamp, keep)
 
-    # -- what the scene is made of -----------------------------------------------------------------------------------
+    def _see(self, channel: str, message: Serialized) -> None:
+        """Keep what the scene is made of; odometry draws it."""
+        if channel == "odometry" and self._scene_pace(message.stamp):
+            self._draw(topics.decode(channel, message.data))
+        elif channel == "ground_truth/odometry":
+            self._truth = message.data
+        elif channel == "trajectory":
+            order = topics.decode(channel, message.data)
+            self._plan = plan_markers(order.trajectory, order.at_end == AtEnd.CONTACT)
+        elif channel == "target/pose":
+            pose = topics.decode(channel, message.data)
+            self._target = target_markers(pose.p_WS, pose.q_WS)
+        elif channel == "powerlines":
+            lines = topics.decode(channel, message.data)
+            self._mapped |= {line.id for line in lines.lines}
+            self._map = map_markers(lines, self._mapped)
+        elif channel == "controller/status":
+            self._words = topics.decode(channel, message.data).message
 
-    def _see_truth(self, data: bytes, stamp: int) -> None:
-        self._truth = data
-
-    def _see_trajectory(self, data: bytes, stamp: int) -> None:
-        order = topics.decode("trajectory", data)
-        self._plan = plan_markers(order.trajectory, order.at_end == AtEnd.CONTACT)
-
-    def _see_target(self, data: bytes, stamp: int) -> None:
-        pose = topics.decode("target/pose", data)
-        self._target = target_markers(pose.p_WS, pose.q_WS)
-
-    def _see_lines(self, data: bytes, stamp: int) -> None:
-        lines = topics.decode("powerlines", data)
-        self._mapped |= {line.id for line in lines.lines}
-        self._map = map_markers(lines, self._mapped)
-
-    def _see_status(self, data: bytes, stamp: int) -> None:
-        self._words = topics.decode("controller/status", data).message
-
-    def _see_odometry(self, data: bytes, stamp: int) -> None:
-        if not self._scene_pace(stamp):
-            return
-        state = topics.decode("odometry", data)
+    def _draw(self, state: OdometryState) -> None:
+        """Send the scene with the vehicle at a state."""
         self._flown.add(state.p_WB)
         found = vehicle_markers(self._vehicle, state, self._words)
         if self._truth:
@@ -169,7 +159,7 @@ class Viewer(Listener[ViewerParameters]):
         if self._scenes % SLOW_SCENE == 0:
             found += self._world + self._plan + self._target + self._map + path_markers(self._flown, self._true_path)
         self._scenes += 1
-        scene = Markers(stamp, tuple(found))
+        scene = Markers(state.stamp, tuple(found))
         self.markers(scene)
         self._send(self.serialized(MARKERS, scene))
-        self.server.tell_time(stamp)
+        self.server.tell_time(state.stamp)

@@ -32,8 +32,7 @@ def _floats(values: Iterable[float]) -> Floats:
     return tuple(float(v) for v in values)
 
 
-def marker(shape: Shape, ns: str, id: int, colour: Colour, scale: Vector, p: Vector = _ORIGIN,
-           q: Vector = _UPRIGHT) -> Marker:
+def marker(shape: Shape, ns: str, id: int, colour: Colour, scale: Vector, p: Vector, q: Vector = _UPRIGHT) -> Marker:
     """A shape at a pose in `map`."""
     return Marker(shape, ns, id, colour, _floats(scale), _floats(p), _floats(q))
 

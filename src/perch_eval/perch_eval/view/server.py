@@ -15,7 +15,7 @@ from perch_eval.view.gate import Gate, hidden_host, unservable
 class LiveServer(foxglove.websocket.ServerListener):
     """Serves topics until it is closed. Time is simulation time."""
 
-    def __init__(self, host: str, port: int, name: str, origins: Iterable[str] = ("*",)) -> None:
+    def __init__(self, host: str, port: int, name: str, origins: Iterable[str]) -> None:
         """
         Args:
             host, port: address that is served; port 0: any free one.
