@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from perch_core.component import Action, Component, Input, Service, ports
+from perch_core.component import Action, Input, Service, ports
 from perch_core.isolated import WAITING_MAX
 from perch_core.registry import resolved
 from perch_core.ros import topics
@@ -45,15 +45,10 @@ def page() -> str:
     return "\n".join([_TEXT, *_topics(), *_requests(), *_values(), ""])
 
 
-def _components() -> Iterator[tuple[str, type[Component]]]:
-    for node, path in COMPONENTS.items():
-        yield node, resolved(path)
-
-
 def _topics() -> Iterator[str]:
     takers: dict[str, dict[str, list[str]]] = {}
-    for node, cls in _components():
-        for port in ports(cls, Input):
+    for node, path in COMPONENTS.items():
+        for port in ports(resolved(path), Input):
             if port.value in limits.LIMITS:
                 channel = port._channel.replace("{camera}", "front").replace("{images}", "image_raw")
                 takers.setdefault(topics.topic(channel).channel, {}).setdefault(port.value.__name__, []).append(node)
@@ -65,7 +60,8 @@ def _topics() -> Iterator[str]:
 
 def _requests() -> Iterator[str]:
     rows = []
-    for node, cls in _components():
+    for node, path in COMPONENTS.items():
+        cls = resolved(path)
         taken = [(port._channel, port.request) for port in ports(cls, Service)] + [(port._channel, port.goal) for port in ports(cls, Action)]
         rows += [(f"`{channel}`", value.__name__, node) for channel, value in taken]
     yield from ("## Requests and goals", "",

@@ -83,8 +83,7 @@ def _in_flight(flight: Flight, vehicle: Vehicle) -> list[Margin]:
                  Margin("least collective thrust", float(thrust[inside].min()), low, math.inf, "N")]
     rates = np.linalg.norm(truth.w[(truth.t >= window[0]) & (truth.t < window[1])], axis=1)
     if len(rates):
-        limit = math.degrees(vehicle.body_rate_max)
-        greatest = math.degrees(float(rates.max()))
+        greatest, limit = math.degrees(float(rates.max())), math.degrees(vehicle.body_rate_max)
         found.append(Margin("greatest body rate (limit of the plan)", greatest, -math.inf, limit, "deg/s"))
     return found
 

@@ -76,8 +76,7 @@ class McapLog:
             self._file.close()
 
 
-def read(path: Path, topics: set[str] | None = None,
-         on_damage: Callable[[str], None] = lambda _: None) -> Iterator[tuple[str, str, int, bytes]]:
+def read(path: Path, on_damage: Callable[[str], None] = lambda _: None) -> Iterator[tuple[str, str, int, bytes]]:
     """Messages of a file in the order written: topic, type, time [ns], data.
 
     A cut-off or damaged file is read as far as it goes; a flight that broke off before its first message has no file at all.
@@ -85,10 +84,9 @@ def read(path: Path, topics: set[str] | None = None,
 
     Args:
         path: the file.
-        topics: only these.
         on_damage: told why a file could not be read to its end.
     """
-    for schema, channel, message in _read(path, topics, on_damage):
+    for schema, channel, message in _read(path, on_damage):
         yield channel.topic, schema.name if schema else "", message.log_time, message.data
 
 
@@ -119,7 +117,7 @@ def make_whole(path: Path, copy: Path) -> str:
     with open(copy, "wb") as file:
         writer = Writer(file)
         writer.start(profile="ros2", library="perch")
-        for schema, channel, message in _read(path, None, damage.append):
+        for schema, channel, message in _read(path, damage.append):
             if schema is not None and schema.id not in schemas:
                 schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
             if channel.id not in channels:
@@ -130,13 +128,12 @@ def make_whole(path: Path, copy: Path) -> str:
     return damage[0] if damage else "it has no end"
 
 
-def _read(path: Path, topics: set[str] | None,
-          on_damage: Callable[[str], None]) -> Iterator[tuple[mcap.records.Schema | None, mcap.records.Channel, mcap.records.Message]]:
+def _read(path: Path, on_damage: Callable[[str], None]) -> Iterator[tuple[mcap.records.Schema | None, mcap.records.Channel, mcap.records.Message]]:
     """As `read`, as the library's records."""
     if not path.exists():
         return
     with open(path, "rb") as file:
         try:
-            yield from NonSeekingReader(file, validate_crcs=True).iter_messages(topics=list(topics) if topics else None, log_time_order=False)
+            yield from NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False)
         except (McapError, EOFError, struct.error, ZstdError, CRCValidationError, UnicodeDecodeError) as error:
             on_damage(str(error) or type(error).__name__)

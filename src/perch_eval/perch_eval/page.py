@@ -14,6 +14,7 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+WIDTH = 640  # of a picture in a grid, at most [px]
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
 h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ddd; }
@@ -77,23 +78,12 @@ def image(figure: Figure | None, title: str = "") -> str:
     return f'<img alt="{text(title)}" src="data:image/png;base64,{base64.b64encode(png.getvalue()).decode()}">'
 
 
-def images(pictures: Iterable[tuple[str, np.ndarray]], width: int = 640) -> str:
-    """A grid of pictures with captions.
-
-    Args:
-        pictures: caption and pixels, uint8, grey or bgr.
-        width: larger ones are reduced to this [px].
-    """
+def images(pictures: Iterable[tuple[str, np.ndarray]]) -> str:
+    """A grid of pictures: caption and pixels, uint8, grey or bgr; those wider than `WIDTH` are reduced."""
     figures = []
     for caption, pixels in pictures:
-        data = base64.b64encode(jpeg(pixels, width)).decode()
+        if (scale := WIDTH / pixels.shape[1]) < 1.0:
+            pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        data = base64.b64encode(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()).decode()
         figures.append(f'<figure><img src="data:image/jpeg;base64,{data}"><figcaption>{text(caption)}</figcaption></figure>')
     return f'<div class="images">{"".join(figures)}</div>' if figures else ""
-
-
-def jpeg(pixels: np.ndarray, width: int) -> bytes:
-    """A picture, reduced to a width [px] where it is wider."""
-    scale = width / pixels.shape[1]
-    if scale < 1.0:
-        pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()

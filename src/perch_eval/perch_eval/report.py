@@ -31,6 +31,7 @@ from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.scene_3d import scene_3d
 from perch_sim.scenario import Scenario
 
+
 def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, message: str, wall_time: float,
                  end_time: float, start_time: float | None = None) -> dict[str, Any]:
     """Read `flight.mcap` in `folder`, of a flight that has just ended, and write `report.json` and `report.html` beside it.
@@ -112,10 +113,10 @@ def _with_unit(key: str, value: float) -> str:
     return f"{_UNIT.sub('', key).replace('_', ' ')} {value:.4g}{f' {UNITS[unit[1]]}' if unit else ''}"
 
 
-def _vector(values: Any, scale: float = 1.0, unit: str = "") -> str:
+def _centimetres(values: Any) -> str:
     if values is None:
         return "not measured"
-    return ", ".join("-" if v is None or not math.isfinite(v) else f"{scale * v:.1f}" for v in values) + f" {unit}"
+    return ", ".join("-" if v is None or not math.isfinite(v) else f"{100 * v:.1f}" for v in values) + " cm"
 
 
 def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
@@ -135,7 +136,7 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("recording", f"cut off or damaged ({report['recording_damage']}): the figures are of what can be read"))
     for kind in ("tracking", "estimation"):
         share = report.get(f"{kind}_judged", 1.0)
-        rows.append((f"{kind} RMSE x, y, z", _vector(report.get(f"{kind}_rmse_m"), 100, "cm") +
+        rows.append((f"{kind} RMSE x, y, z", _centimetres(report.get(f"{kind}_rmse_m")) +
                      (f" (known in {100 * share:.0f} % of the time)" if share < 0.99 else "")))
     return [*rows,
             ("largest body rate", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),

@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from perch_core import config
 from perch_core.errors import PerchError
@@ -18,9 +17,6 @@ from perch_eval.identification.answers import Answer, answers_figure
 from perch_eval.identification.fit import Found, battery, identify
 from perch_eval.identification.record import record_of
 from perch_sim.scenario import load_scenario
-
-if TYPE_CHECKING:
-    from perch_eval.ros.recorded_flight import RecordedFlight
 
 GENTLY = 1.4  # times as long as usual takes a move on another voltage: it asks for half the acceleration
 EXAMPLES = """examples:
@@ -49,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> list[Flight | RecordedFlight]:
+def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> Sequence[Flight]:
     """Those that are recorded, or else flown in the simulator: one, or one at each voltage.
 
     Raises:

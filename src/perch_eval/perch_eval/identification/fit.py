@@ -99,15 +99,15 @@ def rates(record: Record, axis: int, delay: float | None = None, spread: float =
     """
     h, w, free, known = record.period, record.gyro[:, axis], delay is None, delay or 0.0
     assert record.rates is not None
-    commanded = record.rates[:, axis]
+    sent = record.rates[:, axis]
 
     def model(x: np.ndarray) -> np.ndarray:
         late = x[3] if free else known
-        return lagged(x[1] * record.at(record.command_t, commanded, late + h), x[0], h) + x[2]
+        return lagged(x[1] * record.commanded(sent, late + h), x[0], h) + x[2]
 
     n = 4 if free else 3
     x, sigma = _fitted(model, w, (0.04, 1.0, 0.0, 0.005)[:n], (1e-3, 0.2, -0.5, -0.01)[:n], (0.5, 5.0, 0.5, 0.1)[:n])
-    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.at(record.command_t, commanded, 0.0), w, model(x))
+    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.commanded(sent, 0.0), w, model(x))
     why = _untold(answer, LEAST_RATE)
     found = [_judged(f"actuation.rate_lag[{axis}]", x[0], float(np.hypot(sigma[0], spread)), "s", why),
              _judged(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", why)]
@@ -121,7 +121,7 @@ def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) 
     assert sent is not None
     keys = ("motor_time_constant", "thrust_coefficient") if rotors else ("actuation.thrust_lag", "actuation.thrust_gain")
     unit = vehicle.thrust_coefficient / vehicle.mass if rotors else 1.0
-    u = record.at(record.command_t, sent, h if rotors else delay + h)
+    u = record.commanded(sent, h if rotors else delay + h)
 
     def model(x: np.ndarray) -> np.ndarray:
         lag, gain, drag = x

@@ -43,15 +43,15 @@ class Record:
         """Of the IMU [s]."""
         return float(np.median(np.diff(self.t)))
 
-    def at(self, times: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-        """Values as they were `delay` before each IMU sample, between their own times: (n, ...).
+    def commanded(self, values: np.ndarray, delay: float) -> np.ndarray:
+        """Commands (m, ...) as they were `delay` before each IMU sample, between their stamps: (n, ...).
 
         A command that is held for a period h and read between its ends is h / 2 too early, and an IMU that gives means over its own period
         is as late: `delay` is the vehicle's + one period.
         """
         if values.ndim == 1:
-            return np.interp(self.t - delay, times, values)
-        return interpolated(self.t - delay, times, values)
+            return np.interp(self.t - delay, self.command_t, values)
+        return interpolated(self.t - delay, self.command_t, values)
 
 
 def record_of(flight: Flight) -> Record:
@@ -63,14 +63,14 @@ def record_of(flight: Flight) -> Record:
     commands = {channel: [(t, c) for t, c in flight.values(channel) if c.armed]
                 for channel in ("rates_thrust_command", "attitude_thrust_command", "motor_command")}
     channel = max(commands, key=lambda name: len(commands[name]))
-    imu, states, sent = flight.values("imu/data_raw"), flight.states("odometry"), commands[channel]
-    for name, n in {"imu/data_raw": len(imu), "odometry": 0 if states is None else len(states.t), "commands to the vehicle while armed": len(sent)}.items():
+    states, sent = flight.states("odometry"), commands[channel]
+    t, f = flight.vectors("imu/data_raw", lambda sample: sample.f_B)
+    _, w = flight.vectors("imu/data_raw", lambda sample: sample.w_B)
+    counts = {"imu/data_raw": len(t), "odometry": 0 if states is None else len(states.t), "commands to the vehicle while armed": len(sent)}
+    for name, n in counts.items():
         if n < 100:
             raise PerchError(f"the flight has no {name}")
     assert states is not None
-    t = np.array([time for time, _ in imu])
-    f = np.array([sample.f_B for _, sample in imu])
-    w = np.array([sample.w_B for _, sample in imu])
     command_t = np.array([time for time, _ in sent])
     window = max(1, round(0.1 / float(np.median(np.diff(t)))))
     aloft = np.convolve(f[:, 2], np.ones(window) / window, "same") > ALOFT * GRAVITY

@@ -51,7 +51,7 @@ def in_body(listener: Any, sensors: str) -> list[ImuSample]:
     return [taken for _, sample in listener.values["imu/data_raw"] if (taken := axes.in_body(sample)) is not None]
 
 
-def listened(listener: Any, vehicle: Vehicle, sensors: str = "") -> list[Check]:
+def listened(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]:
     """What is judged of a vehicle at rest."""
     values = {channel: [value for _, value in entries] for channel, entries in listener.values.items()}
     channels = [c for c in checks.RATES if not c.startswith("camera_") or c.split("/")[0].removeprefix("camera_") in vehicle.mounts]
@@ -65,18 +65,17 @@ def listened(listener: Any, vehicle: Vehicle, sensors: str = "") -> list[Check]:
     return found + checks.extrinsics(values["/tf_static"], vehicle)
 
 
-def shaken(listener: Any, vehicle: Vehicle, camera: str, sensors: str = "") -> Check:
-    """The rotation between camera and IMU, told while the vehicle is shaken."""
+def shaken(listener: Any, vehicle: Vehicle, camera: str | None, sensors: str) -> Check:
+    """The rotation between camera and IMU, told while the vehicle is shaken; without a camera it is not."""
+    turned = np.zeros((0, 3)), np.zeros((0, 3))
     if camera:
         listener.watch(camera, vehicle.mounts[camera].camera)
         print("shake the vehicle about all axes for 10 s ...", flush=True)
         listener.listen(10.0)
         imu = in_body(listener, sensors)
-        turned_B, turned_C = listener.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3),
-                                     vehicle.mounts[camera].stamp_offset)
-    else:
-        camera, turned_B, turned_C = next(iter(vehicle.mounts), ""), np.zeros((0, 3)), np.zeros((0, 3))
-    return checks.shaken(camera, turned_B, turned_C, vehicle)
+        turned = listener.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3),
+                                       vehicle.mounts[camera].stamp_offset)
+    return checks.shaken(camera or next(iter(vehicle.mounts), ""), *turned, vehicle)
 
 
 def exercised(listener: Any, arguments: argparse.Namespace, bound: float = checks.STOPPED) -> list[Check]:
@@ -116,7 +115,7 @@ def _check(arguments: argparse.Namespace) -> int:
         print(f"listening for {arguments.listen:g} s: the vehicle must stand still on its feet ...", flush=True)
         listener.await_first("imu/data_raw", arguments.listen)
         listener.listen(arguments.listen)
-        found = [*listened(listener, vehicle, arguments.sensors), shaken(listener, vehicle, arguments.shake or "", arguments.sensors),
+        found = [*listened(listener, vehicle, arguments.sensors), shaken(listener, vehicle, arguments.shake, arguments.sensors),
                  *exercised(listener, arguments, checks.STOPPED if vehicle.actuation.type == "rotor_speeds" else checks.DESCENDED)]
     print("\n".join(map(str, found)))
     counts = {verdict: sum(check.verdict is verdict for check in found) for verdict in Verdict}

@@ -97,7 +97,8 @@ class GraphListener(GraphNode):
             self.listen(0.1)
             last = max((self.values[channel][-1][0] for channel in COMMANDS if self.values[channel]), default=None)
             if last is not None and time.monotonic() - last > 3.0 * ANSWER:
-                return last, self._last_motion(last)
+                told = [entry for source in self._motion(last) for entry in source]
+                return last, max((arrival for arrival, turns in told if turns), default=last) if told else None
         return None, None
 
     def await_takeover(self, patience: float) -> tuple[bool, bool | None]:
@@ -111,10 +112,6 @@ class GraphListener(GraphNode):
                 sent = [value.armed for channel in COMMANDS for arrival, value in self.values[channel][-1:] if time.monotonic() - arrival < SETTLING]
                 return True, any(sent)
         return turned, None
-
-    def _last_motion(self, since: float) -> float | None:
-        told = [entry for source in self._motion(since) for entry in source]
-        return max((arrival for arrival, turns in told if turns), default=since) if told else None
 
     def _motion(self, since: float) -> list[list[tuple[float, bool]]]:
         """What each source has told since a time [s] of the motors: when, and whether they turn; without sources that are silent."""
