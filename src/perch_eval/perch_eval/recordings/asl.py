@@ -53,7 +53,9 @@ class AslRecording(Recording):
             raise RecordingError(f"{root}: no image is named in cam*/data.csv")
         self.images = {name: sum(row[1] == name for row in self._frames) for name in folders}
         imu = root / "imu0" / "data.csv"
-        self._stamps, self._imu = table(imu, 7) if imu.is_file() else (np.empty(0, np.int64), np.empty((0, 6)))
+        self._stamps, self._imu = np.empty(0, np.int64), np.empty((0, 6))
+        if imu.is_file():
+            self._stamps, self._imu = table(imu, 7)
         self.samples = int((self._stamps <= self._frames[-1][0] + AFTER).sum())
 
     @property
