@@ -6,20 +6,6 @@ Only the standard library is used here, because nothing else is installed when t
 from .enter import become, command_parser, enter, leave_quietly_on_interrupt, quiet_on_interrupt, run
 from .errors import SetupError
 from .layout import EXTRAS, ROOT
-from .machine import Platform, detect_platform
 from .prepare import prepare
 
-__all__ = [
-    "EXTRAS",
-    "ROOT",
-    "Platform",
-    "SetupError",
-    "become",
-    "command_parser",
-    "detect_platform",
-    "enter",
-    "leave_quietly_on_interrupt",
-    "prepare",
-    "quiet_on_interrupt",
-    "run",
-]
+__all__ = ["EXTRAS", "ROOT", "SetupError", "become", "command_parser", "enter", "leave_quietly_on_interrupt", "prepare", "quiet_on_interrupt", "run"]

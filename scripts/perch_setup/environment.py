@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-from typing import Mapping
 
 from .errors import FAILED, SetupError
 from .layout import SETUP_BASH
@@ -13,26 +12,21 @@ from .machine import Platform
 _OURS = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH", "PYTHONPATH", "PYTHONHOME")
 
 
-def variables(
-    wanted: Platform, caller: Mapping[str, str] = os.environ, with_workspace: bool = True
-) -> dict[str, str]:
+def variables(wanted: Platform, with_workspace: bool = True) -> dict[str, str]:
     """What `source setup.bash` gives, on top of the caller's variables.
 
     Args:
         wanted: where ROS comes from. With our wheels, leftovers of other workspaces are dropped;
             with an installation they are its own and stay.
-        caller: the variables to start from.
         with_workspace: whether the built packages are part of it.
 
     Raises:
         SetupError: where sourcing fails.
     """
-    start = {key: value for key, value in caller.items() if not (wanted.uses_wheels and key in _OURS)}
+    start = {key: value for key, value in os.environ.items() if not (wanted.uses_wheels and key in _OURS)}
     start["PERCH_WITHOUT_WORKSPACE"] = "" if with_workspace else "1"
     script = 'source "$1" >&2 && exec env -0'
-    answer = subprocess.run(
-        ["bash", "--norc", "-c", script, "bash", SETUP_BASH], env=start, capture_output=True
-    )
+    answer = subprocess.run(["bash", "--norc", "-c", script, "bash", SETUP_BASH], env=start, capture_output=True)
     if answer.returncode:
         reason = answer.stderr.decode(errors="replace").strip()
         raise SetupError(f"sourcing {SETUP_BASH} failed: {reason}", FAILED)

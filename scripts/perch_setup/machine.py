@@ -54,19 +54,14 @@ def detect_platform(environment: Mapping[str, str] = os.environ) -> Platform:
     """
     distribution = environment.get("ROS_DISTRO", "")
     if distribution == DISTRIBUTION and _sourced_prefix(environment) is None:
-        raise SetupError(
-            f"ROS_DISTRO is {DISTRIBUTION} in this shell, but no folder of AMENT_PREFIX_PATH has rclpy: run "
-            f"'source /opt/ros/{DISTRIBUTION}/setup.bash' (apt package ros-{DISTRIBUTION}-ros-base), or 'unset ROS_DISTRO' "
-            "and perch brings its own ROS"
-        )
+        raise SetupError(f"ROS_DISTRO is {DISTRIBUTION} in this shell, but no folder of AMENT_PREFIX_PATH has rclpy: run "
+                         f"'source /opt/ros/{DISTRIBUTION}/setup.bash' (apt package ros-{DISTRIBUTION}-ros-base), or 'unset ROS_DISTRO' "
+                         "and perch brings its own ROS")
     if distribution == DISTRIBUTION:
         return INSTALLED
     if distribution:
-        raise SetupError(
-            f"ROS 2 {distribution} is sourced in this shell, perch needs {DISTRIBUTION}: "
-            f"run 'source /opt/ros/{DISTRIBUTION}/setup.bash' in a new shell, or open a shell "
-            "without any ROS and perch brings its own"
-        )
+        raise SetupError(f"ROS 2 {distribution} is sourced in this shell, perch needs {DISTRIBUTION}: "
+                         f"run 'source /opt/ros/{DISTRIBUTION}/setup.bash' in a new shell, or open a shell without any ROS and perch brings its own")
     return INSTALLED if _remembered_installation() else WHEELS
 
 
@@ -110,27 +105,8 @@ def check_python(wanted: Platform, version: Sequence[int] = sys.version_info[:2]
     if sys.platform != "linux":
         raise SetupError(f"{sys.platform} is not supported: perch runs on Linux")
     if wanted.uses_wheels and platform.machine() != "x86_64":
-        raise SetupError(
-            f"there are no ROS wheels for {platform.machine()} processors, only for x86_64: "
-            "install ROS 2 Jazzy (Ubuntu 24.04) and source /opt/ros/jazzy/setup.bash first"
-        )
-
-
-def missing_tools() -> dict[str, str]:
-    """System tools that set-up needs and does not find, each with the apt package that has it."""
-    python = "python3"
-    if Path(sys.base_prefix) == Path("/usr") and not _is_default_python():
-        python = f"python{sys.version_info[0]}.{sys.version_info[1]}"
-    missing = {
-        tool: package
-        for tool, package in (("cmake", "cmake"), ("g++", "g++"), ("make", "make"), ("bash", "bash"))
-        if shutil.which(tool) is None
-    }
-    if importlib.util.find_spec("ensurepip") is None:
-        missing["the venv module of Python"] = f"{python}-venv"
-    if not Path(sysconfig.get_paths()["include"], "Python.h").exists():
-        missing["the headers of Python"] = f"{python}-dev"
-    return missing
+        raise SetupError(f"there are no ROS wheels for {platform.machine()} processors, only for x86_64: "
+                         "install ROS 2 Jazzy (Ubuntu 24.04) and source /opt/ros/jazzy/setup.bash first")
 
 
 def check_tools() -> None:
@@ -139,16 +115,16 @@ def check_tools() -> None:
     Raises:
         SetupError: with each missing tool and the apt line that installs all of them.
     """
-    missing = missing_tools()
+    missing = {tool: tool for tool in ("cmake", "g++", "make", "bash") if shutil.which(tool) is None}  # tool -> its apt package
+    if importlib.util.find_spec("ensurepip") is None:
+        missing["the venv module of Python"] = f"{_apt_python()}-venv"
+    if not Path(sysconfig.get_paths()["include"], "Python.h").exists():
+        missing["the headers of Python"] = f"{_apt_python()}-dev"
     if missing:
-        packages = " ".join(missing.values())
-        raise SetupError(
-            f"missing on this machine: {', '.join(missing)}. Install with:\n"
-            f"    sudo apt-get install {packages}"
-        )
+        raise SetupError(f"missing on this machine: {', '.join(missing)}. Install with:\n    sudo apt-get install {' '.join(missing.values())}")
 
 
-def _is_default_python() -> bool:
-    """Whether apt's `python3-*` packages belong to the Python that runs this."""
-    default = Path("/usr/bin/python3")
-    return default.exists() and default.resolve().name == f"python{sys.version_info[0]}.{sys.version_info[1]}"
+def _apt_python() -> str:
+    """How apt's packages for the Python that runs this begin: those of its default Python, and of one that it did not install, `python3`."""
+    own = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    return own if Path(sys.base_prefix) == Path("/usr") and Path("/usr/bin/python3").resolve().name != own else "python3"

@@ -144,9 +144,7 @@ def _nothing_to_do(wanted: Platform, done: dict[str, str], extras: Collection[st
     if any(done.get(f"extra {extra}") != stamps.extra_stamp(extra, environment) for extra in extras):
         return False
     return (INSTALL / "setup.bash").exists() and all(
-        _is_built(folder, stamps.package_stamp(folder, environment), done)
-        for folder in stamps.packages(wanted)
-    )
+        _is_built(folder, stamps.package_stamp(folder, environment), done) for folder in stamps.packages(wanted))
 
 
 def _is_built(folder: Path, stamp: str, done: dict[str, str]) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import Callable, Mapping, Optional, Sequence
 
 from .alone import held
@@ -43,13 +42,8 @@ class Step:
         if self._terminal or now - self._shown > _QUIET_PERIOD_S:
             self._write(detail)
 
-    def run(
-        self,
-        command: Sequence[object],
-        log: str,
-        environment: Mapping[str, str],
-        describe: Callable[[str], Optional[str]] = lambda line: None,
-    ) -> None:
+    def run(self, command: Sequence[object], log: str, environment: Mapping[str, str],
+            describe: Callable[[str], Optional[str]] = lambda line: None) -> None:
         """Run a tool, log its output, show what `describe` makes of its lines.
 
         Raises:
@@ -59,15 +53,8 @@ class Step:
         file.parent.mkdir(parents=True, exist_ok=True)
         lines: list[str] = []
         with file.open("w") as sink, subprocess.Popen(
-            [str(word) for word in command],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            text=True,
-            errors="replace",
-            env=dict(environment),
-            pass_fds=held(),
-        ) as process:
+                [str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, text=True,
+                errors="replace", env=dict(environment), pass_fds=held()) as process:
             try:
                 for line in process.stdout or ():
                     sink.write(line)
@@ -79,7 +66,8 @@ class Step:
                 _let_finish(process)
                 raise
         if process.returncode:
-            raise SetupError(_failure(log, process.returncode, lines, file), FAILED)
+            shown = "\n".join(f"    {line}" for line in lines)
+            raise SetupError(f"set-up failed in step {log} (exit code {process.returncode}). Its last lines:\n{shown}\nAll of them: {file}", FAILED)
 
     def _write(self, detail: str, final: bool = False) -> None:
         self._shown = time.monotonic()
@@ -97,8 +85,3 @@ def _let_finish(process: subprocess.Popen) -> None:
         process.wait(timeout=5.0)
     except subprocess.TimeoutExpired:
         process.kill()
-
-
-def _failure(tool: str, code: int, lines: Sequence[str], log: Path) -> str:
-    shown = "\n".join(f"    {line}" for line in lines)
-    return f"set-up failed in step {tool} (exit code {code}). Its last lines:\n{shown}\nAll of them: {log}"

@@ -35,10 +35,8 @@ def package_stamp(package: Path, environment: str) -> str:
     Python modules are not part of it: they are linked into the workspace, so edits are live. Of
     configuration files, which are linked too, only the names count.
     """
-    interfaces = (
-        file for kind in ("msg", "srv", "action") for file in sorted((package / kind).glob("*"))
-    )
-    files = [package / name for name in _BUILD_FILES] + list(interfaces)
+    interfaces = (file for kind in ("msg", "srv", "action") for file in sorted((package / kind).glob("*")))
+    files = [*(package / name for name in _BUILD_FILES), *interfaces]
     linked = sorted(str(file) for file in (package / "config").glob("**/*.yaml"))
     return _digest((file for file in files if file.exists()), environment, *linked)
 

@@ -38,7 +38,8 @@ def install(wanted: Platform, fresh: bool) -> None:
         with Step("virtual environment") as step:
             shutil.rmtree(VENV, ignore_errors=True)
             sight = [] if wanted.uses_wheels else ["--system-site-packages"]
-            step.run([_base_python(), "-m", "venv", *sight, VENV], "venv", environment)
+            outside = getattr(sys, "_base_executable", "") or sys.executable  # of any virtual environment: ours has just been removed
+            step.run([outside, "-m", "venv", *sight, VENV], "venv", environment)
     total = sum(_pins(lock.read_text()) for lock in wanted.locks)
     with Step(f"installing {total} packages") as step:
         _pip(step, environment, total, *wanted.locks)
@@ -77,11 +78,6 @@ def _pip(step: Step, environment: Mapping[str, str], total: int, *locks: Path, o
 def usable() -> bool:
     """Whether there is an environment that was finished; what venv writes last is there."""
     return VENV_PYTHON.exists() and (VENV_PYTHON.parent / "activate").exists() and not _UNFINISHED.exists()
-
-
-def _base_python() -> str:
-    """The Python outside of any virtual environment: ours may be about to be removed."""
-    return getattr(sys, "_base_executable", "") or sys.executable
 
 
 def _environment(wanted: Platform) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from pathlib import Path
@@ -45,7 +44,7 @@ def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
 
 def _environment(wanted: Platform) -> dict[str, str]:
     """What colcon, CMake and the generators need around them."""
-    environment = variables(wanted, dict(os.environ), with_workspace=False)
+    environment = variables(wanted, with_workspace=False)
     environment["PYTHONNOUSERSITE"] = "1"
     environment["PWD"] = str(ROOT)
     # CMake asks for `python3` in several ways; all of them end at ours.
