@@ -6,7 +6,6 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Callable
 
 from perch_setup import command_parser, enter
 
@@ -67,23 +66,18 @@ def positive(text: str) -> float:
 
 
 def carry_out(command_line: argparse.ArgumentParser) -> int:
-    """Parse, set up if necessary, and run the sub-command."""
-    arguments = command_line.parse_args()
-    enter()
-    module, function = arguments.handler.split(":")
-    return run(lambda: getattr(importlib.import_module(f"ros_graph.{module}"), function)(arguments))
-
-
-def run(command: Callable[[], int]) -> int:
-    """Run a command; errors become one line, Ctrl-C and a closed pipe end it quietly.
+    """Parse, set up if necessary, and run the sub-command; errors become one line, Ctrl-C and a closed pipe end it quietly.
 
     Returns:
-        The exit code: that of the command, or 2 for the caller's mistakes.
+        The exit code: that of the sub-command, or 2 for the caller's mistakes.
     """
+    arguments = command_line.parse_args()
+    enter()
     from perch_core.errors import PerchError  # there is one inside the environment only
 
+    module, function = arguments.handler.split(":")
     try:
-        code = command()
+        code = getattr(importlib.import_module(f"ros_graph.{module}"), function)(arguments)
         sys.stdout.flush()
         return code
     except (GraphError, PerchError) as error:

@@ -52,18 +52,6 @@ class Visit(GraphNode):
         self.spin_until(settled)
         return seen
 
-    def find(self, observe: Callable[[], T | None], timeout: float) -> T | None:
-        """An observation as soon as there is one; None after the timeout."""
-        found: T | None = None
-
-        def appeared() -> bool:
-            nonlocal found
-            found = observe()
-            return found is not None
-
-        self.spin_until(appeared, timeout)
-        return found
-
     def absolute(self, name: str) -> str:
         """A name as the graph knows it."""
         return name if name.startswith("/") else f"/{name}"

@@ -121,8 +121,8 @@ def topic_type(graph: Visit, topic: str, timeout: float) -> str:
         GraphError: nobody has it, or there are several types.
     """
     absolute = graph.absolute(topic)
-    types = graph.find(lambda: dict(graph.node.get_topic_names_and_types()).get(absolute), timeout)
-    if types is None:
+    types = graph.spin_until(lambda: dict(graph.node.get_topic_names_and_types()).get(absolute), timeout)
+    if not types:
         domain = graph.node.context.get_domain_id()
         raise GraphError(f"topic {absolute} does not exist in ROS domain {domain}; 'topic.py list' shows what does")
     if len(types) > 1:

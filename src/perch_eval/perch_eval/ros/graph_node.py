@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from perch_core.ros.joining import join
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
+T = TypeVar("T")
 SLICE = 0.05  # of a wait, after which an interrupt counts [s]
 
 
@@ -57,14 +59,12 @@ class GraphNode:
         self._executor.spin_once(timeout_sec=timeout)
         self.check()
 
-    def spin_until(self, done: Callable[[], object], timeout: float | None = None) -> bool:
-        """Run what comes until `done`; whether that came before the timeout [s]."""
-        last = None if timeout is None else time.monotonic() + timeout
-        while not done():
-            if last is not None and time.monotonic() > last:
-                return False
+    def spin_until(self, done: Callable[[], T], timeout: float = math.inf) -> T:
+        """Run what comes until `done` gives something true; returns what it gave last, which is not true where the timeout [s] came first."""
+        last = time.monotonic() + timeout
+        while not (found := done()) and time.monotonic() <= last:
             self.spin(SLICE)
-        return True
+        return found
 
     def listen(self, duration: float) -> float:
         """Run what comes for some wall-clock time; returns how long it really was [s]."""
