@@ -57,21 +57,20 @@ class Stop:
     held: float
 
 
-def begun(seed: int = 1) -> tuple[Loop, SupervisedLoop]:
-    """A flight before its first step, with the goal sent."""
-    loop = arrange(SCENARIO, seed)
+def begun() -> tuple[Loop, SupervisedLoop, list[float]]:
+    """A flight before its first step, with the goal sent; and the times of its touches, as they come [s]."""
+    loop, touched = arrange(SCENARIO, 1), []
     simulation = loop.vehicle.simulation
     simulation.loop.close()
     simulation.loop = kept = SupervisedLoop(load_vehicle(SCENARIO.vehicle))
+    loop.vehicle.contact.receivers.append(lambda event: touched.append(loop.time))
     loop.send("mission", goal_of(SCENARIO))
-    return loop, kept
+    return loop, kept, touched
 
 
 def moments() -> dict[str, float]:
     """When each of `PHASES` is in the undisturbed flight [s]."""
-    loop, kept = begun()
-    touched: list[float] = []
-    loop.vehicle.contact.receivers.append(lambda event: touched.append(loop.time))
+    loop, _, touched = begun()
     with closing(loop):
         while not any(phase == "perched" for _, phase, _ in loop.trace.phases):
             loop.step()
@@ -88,9 +87,7 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
         gap: for so long [s]; None: for good.
         kill: the node is killed; else it says nothing.
     """
-    loop, kept = begun()
-    touched: list[float] = []
-    loop.vehicle.contact.receivers.append(lambda event: touched.append(loop.time))
+    loop, kept, touched = begun()
     with closing(loop):
         while loop.time < at:
             loop.step()
@@ -142,7 +139,7 @@ def held_without_link() -> float:
 
 def taken_over(at: float) -> float:
     """From the pilot's switch to the first cycle in which the motors stand, as his arming switch is off [s]."""
-    loop, kept = begun()
+    loop, kept, _ = begun()
     with closing(loop):
         while loop.time < at:
             loop.step()

@@ -89,10 +89,7 @@ class Probe(GraphNode):
 
     def take_off(self) -> None:
         """Wait for the estimate, arm, and fly to a hover at 1 m."""
-        for _ in range(100):
-            if self.diagnostics.get("estimator", {}).get("state") == "RUNNING":
-                break
-            self.listen(0.1)
+        self.spin_until(lambda: self.diagnostics.get("estimator", {}).get("state") == "RUNNING", 10.0)
         self.listen(2.0)
         self.order("controller/command", Command(self.stamp, ARM, "bench"))
         self.listen(0.2)
@@ -196,4 +193,3 @@ def figures(quick: bool) -> list[Figure]:
                 *real_time(scenario, folder / "real_time", windows),
                 *real_time(scenario, folder / "real_time_nmpc", windows, "nmpc"),
                 *real_time(scenario, folder / "real_time_processes", windows, composed=())]
-
