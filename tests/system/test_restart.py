@@ -32,9 +32,9 @@ def test_in_lockstep_they_take_their_places_and_it_perches(tmp_path):
         def acts():
             yield "take_off"
             yield from killed(flight, "vio_model")
-            process = flight.pilot.process("/mission")
+            process = flight.pilot.processes.get("/mission")
             yield from killed(flight, "mission")
-            yield lambda: flight.pilot.process("/mission") != process  # the pilot has discovered it
+            yield lambda: flight.pilot.processes.get("/mission") != process  # the pilot has discovered it
             yield lambda: flight.controller == ControllerStatus.HOVERING
             yield from killed(flight, "estimator")
 

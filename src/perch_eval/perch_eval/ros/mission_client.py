@@ -78,7 +78,13 @@ class _Progress:
 
 
 class MissionClient(GraphNode):
-    """The mission's client. Time is that of `/clock`, in a namespace that of its `clock`."""
+    """The mission's client. Time is that of `/clock`, in a namespace that of its `clock`.
+
+    Attributes:
+        time: newest simulation time seen [s].
+        waiting_for: who the vehicle waits for, with what it owes, as it says on `/diagnostics`; empty: for nobody.
+        processes: node -> where it runs, as its newest diagnostics say; another process after a restart.
+    """
 
     def __init__(self, namespace: str = "") -> None:
         """
@@ -88,24 +94,14 @@ class MissionClient(GraphNode):
         super().__init__("mission_client", in_namespace(namespace))
         self._client = ActionClient(self.node, Perch, "perch")
         self._vehicle = self.node.get_namespace().rstrip("/") + "/vehicle"
-        self._time, self._waiting_for, self._looked = 0.0, "", 0.0
+        self.time, self.waiting_for, self._looked = 0.0, "", 0.0
         self._heard: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
-        self._process: dict[str, str] = {}  # node -> where it runs, as its diagnostics say
+        self.processes: dict[str, str] = {}
         self._silent: set[str] = set()
         self._news: list[str] = []
         self.node.create_subscription(Clock, "/clock", self._receive_clock, topics.topic("/clock").qos.subscribe)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._receive_diagnostics,
                                        topics.topic("/diagnostics").qos.subscribe)
-
-    @property
-    def time(self) -> float:
-        """Newest simulation time seen [s]."""
-        return self._time
-
-    @property
-    def waiting_for(self) -> str:
-        """Who the vehicle waits for, with what it owes, as it says on `/diagnostics`; empty: for nobody."""
-        return self._waiting_for
 
     def news(self) -> list[str]:
         """Which nodes, since the last call, have been started anew, or have fallen silent though others speak: they hang, or have ended."""
@@ -115,10 +111,6 @@ class MissionClient(GraphNode):
             news += [f"{name} has been silent for {SILENT:g} s" for name in sorted(silent - self._silent)]
             self._silent = silent
         return news
-
-    def process(self, node: str) -> str | None:
-        """Where a node runs, as its newest diagnostics say; another process after a restart. None: it has not been heard."""
-        return self._process.get(node)
 
     def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
             check: Callable[[], None] = lambda: None, stall: float = STALL) -> FlightResult:
@@ -141,14 +133,14 @@ class MissionClient(GraphNode):
             now = (msg.feedback.phase, msg.feedback.message)
             if now != seen:
                 seen = now
-                on_phase(self._time, *now)
+                on_phase(self.time, *now)
 
         self._spin_until(self._client.server_is_ready, check, START_PATIENCE, "the mission's action server does not appear")
         for node, service in SERVICES.items():
             if node in scenario.nodes:
                 offered = partial(self.node.count_services, self.node.resolve_service_name(service))
                 self._spin_until(offered, check, START_PATIENCE, f"{node} does not offer {service}")
-        progress, servers = _Progress(self._time), self._servers()
+        progress, servers = _Progress(self.time), self._servers()
         sent = self._client.send_goal_async(goal_message(goal_of(scenario)), feedback_callback=feedback)
 
         def answered() -> bool:
@@ -165,24 +157,24 @@ class MissionClient(GraphNode):
             self.spin(0.05)
             check()
             for words in self.news():
-                on_phase(self._time, seen[0], words)
+                on_phase(self.time, seen[0], words)
             self._look_around(servers, scenario.nodes)
-            still = progress.look(self._time)
+            still = progress.look(self.time)
             if progress.explain():
-                on_phase(self._time, "waiting", f"simulation time stands still: {self._whom()}")
-            if still > (stall if self._time > 0.0 else START_PATIENCE):
-                raise PerchError(f"simulation time has stood still at {self._time:.3f} s for {still:.0f} s: {self._whom()}")
-            if self._time - cancelled > CANCEL_PATIENCE:
+                on_phase(self.time, "waiting", f"simulation time stands still: {self._whom()}")
+            if still > (stall if self.time > 0.0 else START_PATIENCE):
+                raise PerchError(f"simulation time has stood still at {self.time:.3f} s for {still:.0f} s: {self._whom()}")
+            if self.time - cancelled > CANCEL_PATIENCE:
                 raise PerchError(f"the mission has not ended the goal in {CANCEL_PATIENCE:g} s since it was cancelled")
-            if self._time - progress.start > scenario.time_limit and cancelled == math.inf:
-                cancelled = self._time
-                on_phase(self._time, "cancelling", f"time limit of {scenario.time_limit:g} s reached")
+            if self.time - progress.start > scenario.time_limit and cancelled == math.inf:
+                cancelled = self.time
+                on_phase(self.time, "cancelling", f"time limit of {scenario.time_limit:g} s reached")
                 handle.cancel_goal_async()
         answer = result.result().result
         outcome = outcome_of(answer.error_code, scenario)
         if cancelled < math.inf and outcome == "cancelled":
             outcome = "timeout"
-        return FlightResult(outcome, answer.message, answer.end_time or self._time, time.monotonic() - progress.began, progress.start)
+        return FlightResult(outcome, answer.message, answer.end_time or self.time, time.monotonic() - progress.began, progress.start)
 
     def depart(self, check: Callable[[], None] = lambda: None) -> tuple[bool, str]:
         """Have a perched vehicle leave for a hover.
@@ -207,11 +199,11 @@ class MissionClient(GraphNode):
 
     def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 30.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""
-        end = self._time + duration
+        end = self.time + duration
 
         def over() -> bool:
             check()
-            return self._time >= end
+            return self.time >= end
 
         self.spin_until(over, patience)
 
@@ -237,7 +229,7 @@ class MissionClient(GraphNode):
             raise PerchError(f"the mission {'was restarted' if now else 'has ended'}: the goal is lost")
 
     def _whom(self) -> str:
-        return f"waiting for {self._waiting_for}" if self._waiting_for else f"{self._vehicle} does not say why"
+        return f"waiting for {self.waiting_for}" if self.waiting_for else f"{self._vehicle} does not say why"
 
     def _spin_until(self, done: Callable[[], object], check: Callable[[], None], timeout: float, problem: str) -> None:
         def over() -> object:
@@ -245,17 +237,17 @@ class MissionClient(GraphNode):
             return done()
 
         if not self.spin_until(over, timeout):
-            waiting = f" (the vehicle is waiting for {self._waiting_for})" if self._waiting_for else ""
+            waiting = f" (the vehicle is waiting for {self.waiting_for})" if self.waiting_for else ""
             raise PerchError(f"{problem} within {timeout:g} s{waiting}")
 
     def _receive_clock(self, msg: Clock) -> None:
-        self._time = max(self._time, msg.clock.sec + 1e-9 * msg.clock.nanosec)
+        self.time = max(self.time, msg.clock.sec + 1e-9 * msg.clock.nanosec)
 
     def _receive_diagnostics(self, msg: DiagnosticArray) -> None:
         for status in msg.status:
             self._heard[status.name] = time.monotonic()
-            if self._process.setdefault(status.name, status.hardware_id) != status.hardware_id:
-                self._process[status.name] = status.hardware_id
+            if self.processes.setdefault(status.name, status.hardware_id) != status.hardware_id:
+                self.processes[status.name] = status.hardware_id
                 self._news.append(f"{status.name} was restarted")
             if status.name == self._vehicle:
-                self._waiting_for = next((pair.value for pair in status.values if pair.key == "waiting_for"), "")
+                self.waiting_for = next((pair.value for pair in status.values if pair.key == "waiting_for"), "")
