@@ -82,7 +82,7 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
         raise ConfigError("--seed", str(seed), "is outside [0, 2147483647]")
     say = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)
     with own_domain(), _replaced(output_folder(out) / "flight.mcap"):
-        started = programs(scenario, seed, scenario_source=str(source.resolve()), composed=composed, lockstep=not realtime,
+        started = programs(scenario, seed, folder=out / "logs", scenario_source=str(source.resolve()), composed=composed, lockstep=not realtime,
                            record=out / "flight.mcap", hold_for_goal=not realtime)
         stack = Stack(started, out / "logs", on_line=say)
         print(f"{scenario.name}, seed {seed}: starting {len(started)} processes", flush=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,6 @@ from perch_core.errors import PerchError
 from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
 from perch_sim.scenario import NODES, Scenario
-
-Overrides = Mapping[str, Mapping[str, Any]]
 
 ALL_NODES = tuple(NODES)
 CHAIN_NODES = ("vehicle", "estimator", "controller", "description")
@@ -30,40 +27,35 @@ def sharing(names: Collection[str] | None, otherwise: Collection[str] = ()) -> C
     return otherwise if names is None else names or ALL_NODES
 
 
-def programs(scenario: Scenario, seed: int = 1, *, scenario_source: str = "", composed: Collection[str] = (),
-             lockstep: bool = True, record: Path | None = None, hold_for_goal: bool = False,
-             overrides: Overrides | None = None, namespace: str = "", folder: Path | None = None) -> tuple[Program, ...]:
+def programs(scenario: Scenario, seed: int = 1, *, folder: Path, scenario_source: str = "", composed: Collection[str] = (), lockstep: bool = True,
+             record: Path | None = None, hold_for_goal: bool = False, overrides: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[Program, ...]:
     """The programs of a whole scenario.
 
     Args:
         scenario: what is flown.
         seed: of every random number in the flight.
+        folder: receives the parameter files.
         scenario_source: file of the scenario, where it is none of `config/scenarios`.
         composed: nodes that share a process, as far as the scenario has them; the others have one each.
         lockstep: simulation time waits for all who take part; otherwise the wall clock paces it.
         record: add a recorder that writes this MCAP file.
         hold_for_goal: let simulation time begin when the mission has a goal.
-        overrides: node -> parameter -> value, over everything else.
-        namespace: of every node, as in `/quad1`.
-        folder: receives the parameter files; by default `logs` beside the recording, or a temporary folder.
+        overrides: of other nodes, node -> parameter -> value, over everything else.
 
     Raises:
         PerchError: parameters or nodes are refused, or the workspace is not built.
     """
     nodes = choose_nodes(scenario, extra=("recorder",) if record else ())
-    own: dict[str, dict[str, Any]] = {node: dict(values) for node, values in (overrides or {}).items()}
+    own = dict(overrides or {})
     if record:
-        own["recorder"] = {"file": str(record.absolute()), **own.get("recorder", {})}
+        own["recorder"] = {"file": str(record.absolute())}
     if hold_for_goal and "mission" in nodes:
-        own["mission"] = {"lockstep_hold": "perch", **own.get("mission", {})}
-    if folder is None:
-        folder = record.parent / "logs" if record else Path(tempfile.mkdtemp(prefix="perch-"))
+        own["mission"] = {"lockstep_hold": "perch"}
     launches = node_launches(scenario, nodes, seed=seed, scenario_source=scenario_source, lockstep=lockstep, overrides=own)
-    return node_programs(launches, folder, namespace=namespace, composed=composed)
+    return node_programs(launches, folder, composed=composed)
 
 
-def node_programs(launches: Sequence[NodeLaunch], folder: Path, *, namespace: str = "",
-                  composed: Collection[str] = ()) -> tuple[Program, ...]:
+def node_programs(launches: Sequence[NodeLaunch], folder: Path, *, namespace: str = "", composed: Collection[str] = ()) -> tuple[Program, ...]:
     """The programs for some nodes. Their parameter files are written into `folder`.
 
     Args:
@@ -83,8 +75,7 @@ def node_programs(launches: Sequence[NodeLaunch], folder: Path, *, namespace: st
     found = []
     if together:
         plan = folder / "composed.json"
-        plan.write_text(json.dumps(
-            [{"name": n.name, "module": n.module, "arguments": arguments[n.name]} for n in together], indent=1))
+        plan.write_text(json.dumps([{"name": n.name, "module": n.module, "arguments": arguments[n.name]} for n in together], indent=1))
         found.append(Program("composed", (executable("perch_eval", "composed"), str(plan)),
                              tuple(qualified_name(n.name, namespace) for n in together)))
     found += [Program(n.name, (executable(n.package, n.name), *arguments[n.name]), (qualified_name(n.name, namespace),))

@@ -47,17 +47,11 @@ class Ending:
     tail: tuple[str, ...]
     log: Path
 
-    @property
-    def reason(self) -> str:
-        """The exit code, or the signal, in words."""
-        if self.code >= 0:
-            return f"exit code {self.code}"
-        return f"killed by {signal.Signals(-self.code).name}"
-
     def __str__(self) -> str:
+        reason = f"exit code {self.code}" if self.code >= 0 else f"killed by {signal.Signals(-self.code).name}"
         lines = "".join(f"\n    {line}" for line in self.tail)
         last = f". Its last lines ({self.log}):{lines}" if lines else f" without a word ({self.log})"
-        return f"{self.name} ended: {self.reason}{last}"
+        return f"{self.name} ended: {reason}{last}"
 
 
 class RunningProgram:
@@ -73,8 +67,7 @@ class RunningProgram:
         on_line: receives (name, line), from a thread of its own, for each line that it writes.
     """
 
-    def __init__(self, program: Program, log: Path, environment: Mapping[str, str],
-                 on_line: Callable[[str, str], None]) -> None:
+    def __init__(self, program: Program, log: Path, environment: Mapping[str, str], on_line: Callable[[str, str], None]) -> None:
         self.program = program
         self._log = log
         self._on_line = on_line
