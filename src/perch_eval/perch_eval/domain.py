@@ -14,7 +14,7 @@ import psutil
 
 from perch_core.errors import PerchError
 from perch_core.ros.shared_memory import end_unfinished
-from perch_eval.shared_memory import FIRST_PORT, PORTS
+from perch_eval.shared_memory import ports
 
 USABLE = range(43, 102)
 """Up to 101 the ports stay below Linux's ephemeral ones; 42 is the default of `setup.bash`, smaller ones are people's."""
@@ -66,8 +66,7 @@ def own_domain(candidates: Iterable[int] | None = None) -> Iterator[int]:
 
 def participants(domain: int) -> list[int]:
     """UDP ports of a domain that are bound on this machine."""
-    first = FIRST_PORT + PORTS * domain
-    return sorted({socket.laddr.port for socket in psutil.net_connections("udp") if socket.laddr and first <= socket.laddr.port < first + PORTS})
+    return sorted({socket.laddr.port for socket in psutil.net_connections("udp") if socket.laddr and socket.laddr.port in ports(domain)})
 
 
 def free_domain() -> int:

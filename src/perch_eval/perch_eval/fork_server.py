@@ -12,7 +12,6 @@ import signal
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import psutil
@@ -22,7 +21,7 @@ from perch_core.registry import resolved
 
 
 class ForkServer:
-    """The caller's side, one in a process; `close` ends everything that was started, and so does the end of the caller."""
+    """The caller's side, one in a process, whose end ends everything that was started."""
 
     def __init__(self, modules: Sequence[str]) -> None:
         """
@@ -31,7 +30,6 @@ class ForkServer:
         """
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["perch_eval.ended_with_caller", *modules])
-        self._started: list[ForkServerProcess] = []
 
     def start(self, what: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str]) -> int:
         """Start a node.
@@ -53,16 +51,8 @@ class ForkServer:
             process.start()
         except (OSError, EOFError) as error:
             raise PerchError(f"the process that starts nodes has ended ({error or 'while it loaded their code'})") from None
-        self._started.append(process)
         assert process.pid is not None
         return process.pid
-
-    def close(self) -> None:
-        """End everything."""
-        for process in self._started:
-            process.kill()
-        for process in self._started:
-            process.join()
 
 
 def alive(pid: int) -> bool:

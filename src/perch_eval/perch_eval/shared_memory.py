@@ -14,8 +14,6 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-FIRST_PORT, PORTS = 7400, 250
-"""First port of domain 0, and how many each domain has (DDSI-RTPS 2.5, 9.6.2.3)."""
 PORT = re.compile(r"(?:sem\.)?fast\w+_port(\d+)")
 _FOLDER = Path("/dev/shm")
 _SEGMENT = re.compile(r"(/dev/shm/(?:sem\.)?fast(?:rtps|dds)_\S+)")
@@ -26,21 +24,19 @@ class SharedMemory:
 
     Args:
         proc: the process file system.
+
+    Attributes:
+        seen: the remembered segments.
     """
 
     def __init__(self, proc: Path = Path("/proc")) -> None:
         self._proc = proc
-        self._seen: set[str] = set()
+        self.seen: set[str] = set()
 
     def observe(self, pids: Iterable[int]) -> None:
         """Remember the segments that these processes use now."""
         for pid in pids:
-            self._seen |= self._used_by(self._proc / str(pid))
-
-    @property
-    def seen(self) -> frozenset[str]:
-        """The remembered segments."""
-        return frozenset(self._seen)
+            self.seen |= self._used_by(self._proc / str(pid))
 
     def clean(self) -> list[str]:
         """Remove the remembered segments that no process uses any more, or whose maker has ended, with their lock files; one that a
@@ -49,10 +45,10 @@ class SharedMemory:
         Returns:
             The files that were removed.
         """
-        if not self._seen:
+        if not self.seen:
             return []
         removed = []
-        for segment in sorted(self.unused(self._seen)):
+        for segment in sorted(self.unused(self.seen)):
             mutex = Path(segment).with_name(f"sem.{Path(segment).name}_mutex")  # stays after a process that ended by itself, too
             for file in (Path(segment), Path(f"{segment}_el"), Path(f"{segment}_sl"), mutex):
                 with suppress(OSError):  # gone already, or another user's
@@ -73,10 +69,14 @@ class SharedMemory:
             return set()
 
 
+def ports(domain: int) -> range:
+    """The UDP ports of a ROS domain (DDSI-RTPS 2.5, 9.6.2.3)."""
+    return range(7400 + 250 * domain, 7400 + 250 * (domain + 1))
+
+
 def of_ports(domain: int) -> set[Path]:
     """Files of the segments in which the ports of a ROS domain receive, with their locks."""
-    first = FIRST_PORT + PORTS * domain
-    return {file for file in _FOLDER.glob("*fast*_port*") if (of := PORT.match(file.name)) and first <= int(of[1]) < first + PORTS}
+    return {file for file in _FOLDER.glob("*fast*_port*") if (of := PORT.match(file.name)) and int(of[1]) in ports(domain)}
 
 
 def segment(file: Path) -> str:

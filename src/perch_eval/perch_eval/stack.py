@@ -52,8 +52,7 @@ class Stack:
         on_line: receives (program name, line) for each line of output, from several threads.
     """
 
-    def __init__(self, programs: Sequence[Program], log_dir: Path,
-                 on_line: Callable[[str, str], None] = lambda name, line: None) -> None:
+    def __init__(self, programs: Sequence[Program], log_dir: Path, on_line: Callable[[str, str], None] = lambda name, line: None) -> None:
         self._programs = tuple(programs)
         self._log_dir = log_dir
         self._environment = {**os.environ, "PYTHONUNBUFFERED": "1", "ROS_LOG_DIR": str(log_dir)}
@@ -129,8 +128,7 @@ class Stack:
 
     def raise_if_ended(self) -> None:
         """Raise StackError, with reason and last lines, where a program has ended."""
-        endings = self.endings()
-        if endings:
+        if endings := self.endings():
             raise StackError("\n".join(str(ending) for ending in endings), endings)
 
     def stop(self) -> dict[str, Ending]:

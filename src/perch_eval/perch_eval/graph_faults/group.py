@@ -103,11 +103,11 @@ class Group:
 
     def left(self) -> tuple[str, ...]:
         """What is left when all have been stopped, the pilot included, in words; shared memory is cleaned first."""
-        end, seen = time.monotonic() + GOING, self._memory.seen
+        end = time.monotonic() + GOING
         while True:  # threads of a process that has ended may hold what it had open for a moment
             self._memory.clean()
             processes = [f"process {pid}" for leader in self._sessions for pid in session(leader)]
-            found = (*processes, *self._sockets(), *self._shared_memory(seen))
+            found = (*processes, *self._sockets(), *self._shared_memory())
             if not found or time.monotonic() > end:
                 return found
             time.sleep(0.1)
@@ -116,9 +116,9 @@ class Group:
         mine = f"perch-lockstep-{os.getuid()}-{self._domain}-"
         return [f"socket {line.split()[-1]}" for line in Path("/proc/net/unix").read_text().splitlines() if mine in line]
 
-    def _shared_memory(self, seen: frozenset[str]) -> list[str]:
+    def _shared_memory(self) -> list[str]:
         """Segments of these processes, or of a port of their domain, that no process uses any more or whose maker has ended."""
         ports = of_ports(self._domain) - self._before  # other ports are shared with other domains
-        found = ports | {Path(name) for name in seen if Path(name).exists() and not PORT.match(Path(name).name)}
+        found = ports | {Path(name) for name in self._memory.seen if Path(name).exists() and not PORT.match(Path(name).name)}
         unused = SharedMemory().unused(map(segment, found))
         return [f"shared memory {file.name}" for file in sorted(found) if segment(file) in unused]
