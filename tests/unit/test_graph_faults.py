@@ -20,7 +20,7 @@ from perch_eval.graph_faults.cases import (
     FAULTS, LOCKSTEP, MODES, NODES, PHASES, PROCESS, REAL_TIME, SAFE, WORDS, Case, Situation, cases, ending, named)
 from perch_eval.graph_faults.flight import UNANSWERED, _Director
 from perch_eval.graph_faults.relay_node import DELAY, Disturbance
-from perch_eval.fork_server import ForkServer, alive, session
+from perch_eval.fork_server import alive, session, start
 
 CASE = Case("kill", "estimator", "climb", LOCKSTEP)
 
@@ -153,8 +153,7 @@ def test_processes_of_a_fork_server_are_their_own(tmp_path, monkeypatch):
         "import os, subprocess, sys, time\ndef sleeper():\n    print(sys.argv[1], os.environ['WORD'], flush=True)\n"
         "    subprocess.Popen(['sleep', '60'])\n    time.sleep(60)\n")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
-    server = ForkServer(("sleeper",))
-    pids = [server.start("sleeper:sleeper", [f"number {k}"], tmp_path / f"{k}.log", {"WORD": "heard"}) for k in range(2)]
+    pids = [start("sleeper:sleeper", [f"number {k}"], tmp_path / f"{k}.log", {"WORD": "heard"}, "sleeper") for k in range(2)]
     until(lambda: all(len(session(pid)) == 2 for pid in pids))
     assert [Path(tmp_path / f"{k}.log").read_text() for k in range(2)] == ["number 0 heard\n", "number 1 heard\n"]
     os.kill(pids[0], signal.SIGKILL)
@@ -170,8 +169,8 @@ def test_processes_of_a_fork_server_end_with_a_caller_that_is_killed(tmp_path, m
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     log = tmp_path / "log"
     caller = subprocess.Popen([sys.executable, "-c", (
-        "import time; from pathlib import Path; from perch_eval.fork_server import ForkServer\n"
-        f"print(ForkServer(('sleeper',)).start('sleeper:sleeper', [], Path({str(log)!r}), {{}}), flush=True); time.sleep(60)")],
+        "import time; from pathlib import Path; from perch_eval.fork_server import start\n"
+        f"print(start('sleeper:sleeper', [], Path({str(log)!r}), {{}}, 'sleeper'), flush=True); time.sleep(60)")],
         stdout=subprocess.PIPE, text=True)
     pid = int(caller.stdout.readline())
     until(lambda: not begun or log.exists() and log.read_text())

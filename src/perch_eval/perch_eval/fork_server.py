@@ -20,39 +20,31 @@ from perch_core.processes import end_with_parent
 from perch_core.registry import resolved
 
 
-class ForkServer:
-    """The caller's side, one in a process, whose end ends everything that was started."""
+def start(what: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str], preload: str) -> int:
+    """Start a node, which ends with this process.
 
-    def __init__(self, modules: Sequence[str]) -> None:
-        """
-        Args:
-            modules: what is loaded before anything is forked.
-        """
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["perch_eval.ended_with_caller", *modules])
+    Args:
+        what: `module:name` of something with `main()`, or of a function.
+        arguments: of its command line.
+        log: receives what it writes.
+        environment: on top of the caller's.
+        preload: module that is loaded before this process starts its first node.
 
-    def start(self, what: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str]) -> int:
-        """Start a node.
+    Returns:
+        Its process id, which leads a session of its own.
 
-        Args:
-            what: `module:name` of something with `main()`, or of a function.
-            arguments: of its command line.
-            log: receives what it writes.
-            environment: on top of the caller's.
-
-        Returns:
-            Its process id, which leads a session of its own.
-
-        Raises:
-            PerchError: the server has ended.
-        """
-        process = self._context.Process(target=_become, args=(what, tuple(arguments), log, dict(environment)))
-        try:
-            process.start()
-        except (OSError, EOFError) as error:
-            raise PerchError(f"the process that starts nodes has ended ({error or 'while it loaded their code'})") from None
-        assert process.pid is not None
-        return process.pid
+    Raises:
+        PerchError: the process that forks has ended.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["perch_eval.ended_with_caller", preload])
+    process = context.Process(target=_become, args=(what, tuple(arguments), log, dict(environment)))
+    try:
+        process.start()
+    except (OSError, EOFError) as error:
+        raise PerchError(f"the process that starts nodes has ended ({error or 'while it loaded their code'})") from None
+    assert process.pid is not None
+    return process.pid
 
 
 def alive(pid: int) -> bool:

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.evaluation.document import machine, table
-from perch_eval.fork_server import ForkServer
 from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NAMED, PHASES, REAL_TIME, SAFE, TRAFFIC, Case, cases
 from perch_eval.graph_faults.flight import fly
 from perch_eval.revision import banner, commit, digest
@@ -99,12 +98,6 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
                     print(f"\n{case.name}: {'; '.join(words)}", file=sys.stderr, flush=True)
 
 
-@lru_cache(maxsize=1)
-def _server() -> ForkServer:
-    """One in each process that flies."""
-    return ForkServer(("perch_eval.graph_faults.preload",))
-
-
 def _fly(logs: Path, case: Case) -> dict[str, Any] | str:
     """The row of a flight, or why there is none."""
     folder = logs / case.name.replace(", ", "_").replace(" ", "_")
@@ -112,7 +105,7 @@ def _fly(logs: Path, case: Case) -> dict[str, Any] | str:
         old.unlink()
     code = digest()
     try:
-        return {**asdict(fly(case, _server(), folder, commit())), "code": code}
+        return {**asdict(fly(case, folder, commit())), "code": code}
     except PerchError as error:
         return f"not flown: {error}"
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from perch_core.errors import PerchError
 from perch_eval.domain import own_domain
-from perch_eval.fork_server import ForkServer, alive
+from perch_eval.fork_server import alive
 from perch_eval.graph_faults.cases import LOCKSTEP, NAMED, PROCESS, SAFE, Case, Situation, ending, named
 from perch_eval.graph_faults.group import Group
 from perch_eval.graph_faults.ros.watcher import Watcher
@@ -24,10 +24,10 @@ from perch_sim.obstacles import pad_surface
 from perch_sim.scenario import load_scenario
 
 SCENARIO = """
-extends: {base}
-name: {base}_blind
+extends: surface_90
+name: surface_90_blind
 nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
-parameters: {{perching_planner: {{time_limit: 20.0}}, mission: {{mission.plan_lead: 1.5}}, vehicle: {{lockstep_timeout: 8.0}}}}
+parameters: {perching_planner: {time_limit: 20.0}, mission: {mission.plan_lead: 1.5}, vehicle: {lockstep_timeout: 8.0}}
 """
 """What is flown: without images. A busy machine may take its time to plan, 1.5 s instead of 0.1; the lockstep goes on without a node
 that hangs after 8 s instead of 60."""
@@ -106,8 +106,21 @@ class _Director:
 
     def look(self) -> None:
         """Strike, if it is time."""
-        if self.struck is None and self._now():
-            self.strike()
+        if self.struck is not None or not self._now():
+            return
+        case, group = self._case, self._group
+        self.before = self._watcher.situation() or self.before
+        self.at, self.struck = self._watcher.time, time.time()
+        if case.fault not in PROCESS:
+            self._watcher.disturb(case.fault)
+        elif case.fault == "stop":
+            group.signal(case.node, signal.SIGSTOP)
+        else:
+            group.signal(case.node, signal.SIGKILL)
+            if case.fault == "restart":
+                while alive(group.pids[case.node]):
+                    time.sleep(0.001)
+                group.start(case.node)
 
     def follow(self) -> None:
         """As `look`, while the goal is awaited.
@@ -136,29 +149,12 @@ class _Director:
             return phase in ("tracking", "verifying") and (self._pad.normal @ (watcher.position - self._pad.p_WS)) < NEAR
         return phase == "perched" and elapsed > 0.5 * self._share
 
-    def strike(self) -> None:
-        """Make it happen."""
-        case, group = self._case, self._group
-        self.before = self._watcher.situation() or self.before
-        self.at, self.struck = self._watcher.time, time.time()
-        if case.fault not in PROCESS:
-            self._watcher.disturb(case.fault)
-        elif case.fault == "stop":
-            group.signal(case.node, signal.SIGSTOP)
-        else:
-            group.signal(case.node, signal.SIGKILL)
-            if case.fault == "restart":
-                while alive(group.pids[case.node]):
-                    time.sleep(0.001)
-                group.start(case.node)
 
-
-def fly(case: Case, server: ForkServer, folder: Path, commit: str = "") -> Row:
+def fly(case: Case, folder: Path, commit: str) -> Row:
     """Fly one case.
 
     Args:
         case: what happens.
-        server: has loaded the nodes.
         folder: receives scenario, parameters and logs.
         commit: of the code, for the row.
 
@@ -168,12 +164,12 @@ def fly(case: Case, server: ForkServer, folder: Path, commit: str = "") -> Row:
     began = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     source = folder / "flown.yaml"
-    source.write_text(SCENARIO.format(base="surface_90"))
+    source.write_text(SCENARIO)
     scenario, lockstep = load_scenario(source), case.mode == LOCKSTEP
     hold = {"mission": {"lockstep_hold": "perch"}} if lockstep else None
     launches = blind_launches(scenario, case.seed, str(source), lockstep, overrides=hold)
     with own_domain(sorted(DOMAINS, key=lambda d: (d - case.seed) % len(DOMAINS))) as domain:
-        group, pilot = Group(server, launches, case, folder, domain), MissionClient()
+        group, pilot = Group(launches, case, folder, domain), MissionClient()
         try:
             watcher = Watcher(pilot)
             director = _Director(case, group, watcher, scenario.mission.takeoff_height, pad_surface(scenario, 0.0))

@@ -9,7 +9,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from perch_eval.fork_server import ForkServer, alive, session
+from perch_eval.fork_server import alive, session, start
 from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, TALKERS, Case
 from perch_eval.graph_faults.relay_node import DIRECT
 from perch_eval.modelled_sight_node import MODULE, NODES as SIGHTS
@@ -30,17 +30,17 @@ class Group:
         nodes: fully qualified names.
     """
 
-    def __init__(self, server: ForkServer, launches: tuple[NodeLaunch, ...], case: Case, folder: Path, domain: int) -> None:
+    def __init__(self, launches: tuple[NodeLaunch, ...], case: Case, folder: Path, domain: int) -> None:
         """
         Args:
-            server: starts them.
             launches: the nodes.
             case: says who has a process, and whose messages pass the relay.
             folder: receives parameters and logs.
             domain: ROS domain.
         """
-        self._server, self._folder, self._domain, self._nice = server, folder, domain, NICE if case.mode == LOCKSTEP else 0
-        self._commands = {one.name: (self._place(one), ros_arguments(one, folder)) for one in launches}
+        self._folder, self._domain, self._nice = folder, domain, NICE if case.mode == LOCKSTEP else 0
+        self._commands = {one.name: (f"{MODULE}:{one.name.upper()}" if one.name in SIGHTS else f"{one.module}:NODE", ros_arguments(one, folder))
+                          for one in launches}
         self.nodes = {f"/{name}" for name in self._commands}
         together = [] if case.alone else [one for one in launches if one.name not in (*SIGHTS, case.node)]
         if together:
@@ -57,14 +57,10 @@ class Group:
         self._memory = SharedMemory()
         self._before = of_ports(domain)
 
-    @staticmethod
-    def _place(one: NodeLaunch) -> str:
-        return f"{MODULE}:{one.name.upper()}" if one.name in SIGHTS else f"{one.module}:NODE"
-
     def start(self, name: str) -> None:
         """Start a node, for the first time or again."""
         what, arguments = self._commands[name]
-        pid = self._server.start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)})
+        pid = start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)}, "perch_eval.graph_faults.preload")
         os.setpriority(os.PRIO_PROCESS, pid, self._nice)
         self.pids[name] = pid
         self._sessions.append(pid)

@@ -48,11 +48,15 @@ class Watcher:
         """Have the relay do something to what it passes on."""
         self._fault.publish(String(data=fault))
 
+    def _value(self, channel: str) -> Any:
+        newest = self._newest.get(channel)
+        return None if newest is None else topics.decode(channel, newest)
+
     @property
     def position(self) -> tuple[float, ...] | None:
         """True position of the centre of mass in W [m]; None: nothing has come yet."""
-        newest = self._newest.get("ground_truth/odometry")
-        return None if newest is None else topics.decode("ground_truth/odometry", newest).p_WB
+        state = self._value("ground_truth/odometry")
+        return None if state is None else state.p_WB
 
     @property
     def height(self) -> float:
@@ -63,16 +67,15 @@ class Watcher:
     @property
     def time(self) -> float:
         """Stamp of the newest true state [s]; 0: nothing has come yet."""
-        newest = self._newest.get("ground_truth/odometry")
-        return 0.0 if newest is None else seconds(topics.decode("ground_truth/odometry", newest).stamp)
+        state = self._value("ground_truth/odometry")
+        return 0.0 if state is None else seconds(state.stamp)
 
     def situation(self) -> Situation | None:
         """As it is now; None: not all has come yet."""
-        if not {"ground_truth/odometry", "rotor_state"} <= set(self._newest):
+        state, rotors, status = map(self._value, ("ground_truth/odometry", "rotor_state", "controller/status"))
+        if state is None or rotors is None:
             return None
-        state, rotors = (topics.decode(channel, self._newest[channel]) for channel in ("ground_truth/odometry", "rotor_state"))
-        status = self._newest.get("controller/status")
         held = [c.state for c in self.contacts if c.state in (ContactState.NONE, ContactState.ATTACHED)][-1:] == [ContactState.ATTACHED]
-        hovers = status is not None and topics.decode("controller/status", status).state == State.HOVERING
+        hovers = status is not None and status.state == State.HOVERING
         return Situation(self.height, math.dist(state.v_WB, (0.0,) * 3), float(tilt_degrees(np.array(state.q_WB))),
                          max(rotors.speed), held, hovers)
