@@ -17,7 +17,6 @@ EXAMPLES = """examples:
 
 files: plan.csv, plan.json (coefficients or figures, certificates), plan.png; powerline: visibility.png, plan.gif
 exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or file, 3 the independent verifier refuses the plan"""
-FOUND_BROKEN = 3
 
 
 def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
@@ -42,7 +41,7 @@ def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
         print(f"the verifier refuses it: {finding.requirement} broken by {finding.excess:.3g} at {finding.time:.3f} s", file=sys.stderr)
     if not broken:
         print("the independent verifier finds nothing broken")
-    return FOUND_BROKEN if broken else 0
+    return 3 if broken else 0
 
 
 def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool) -> int:
@@ -67,7 +66,6 @@ def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool) -> i
 
 
 KINDS = {"perch": _plan_perch, "powerline": _plan_powerline}
-ANIMATED = ("powerline",)
 
 
 def _apply(mapping: dict, changes: list[str]) -> None:
@@ -111,8 +109,8 @@ def main() -> int:
             kind = mapping.get("kind") if isinstance(mapping, dict) else mapping
             raise ConfigError(str(path), "kind", f"{kind!r} is not one of {', '.join(KINDS)}")
         _apply(mapping, arguments.set)
-        if arguments.animation and mapping["kind"] not in ANIMATED:
-            raise ConfigError("--animation", mapping["kind"], f"only for {', '.join(ANIMATED)}")
+        if arguments.animation and mapping["kind"] != "powerline":
+            raise ConfigError("--animation", mapping["kind"], "only for powerline")
         source = " ".join([str(path), *(f"--set {change}" for change in arguments.set)])
         return KINDS[mapping["kind"]](mapping, source, arguments.out, arguments.animation)
     except PlanningRefusal as refusal:

@@ -48,9 +48,7 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--namespace", default="", metavar="NS", help="namespace of every node, as in /quad1")
     parser.add_argument("--log-dir", type=Path, metavar="DIR", help="logs and parameters (default: out/stack/<time>-<process>)")
     parser.add_argument("--ready-timeout", type=float, default=180.0, metavar="S", help="how long nodes may take to come up (default: %(default)g s)")
-    parser.add_argument(
-        "-p", "--parameter", action="append", default=[], metavar="NODE.PARAM:=VALUE", help="over every file; repeatable"
-    )
+    parser.add_argument("-p", "--parameter", action="append", default=[], metavar="NODE.PARAM:=VALUE", help="over every file; repeatable")
     return parser
 
 
@@ -113,27 +111,16 @@ def run(arguments: argparse.Namespace) -> None:
         viewer = overrides["viewer"] = {"port": arguments.view} | overrides.get("viewer", {})
         if viewer["port"] == arguments.view:
             check_free(str(viewer.get("host", "127.0.0.1")), arguments.view)
-    launches = node_launches(
-        scenario,
-        choose_nodes(scenario, arguments.only, arguments.without, ("viewer",) if arguments.view is not None else ()),
-        seed=arguments.seed,
-        scenario_source=str(source),
-        lockstep=not arguments.realtime,
-        overrides=overrides,
-    )
+    nodes = choose_nodes(scenario, arguments.only, arguments.without, ("viewer",) if arguments.view is not None else ())
+    launches = node_launches(scenario, nodes, seed=arguments.seed, scenario_source=str(source), lockstep=not arguments.realtime, overrides=overrides)
     folder = output_folder((arguments.log_dir or own_folder()).absolute(), "--log-dir")
     programs = node_programs(launches, folder, namespace=arguments.namespace, composed=sharing(arguments.composed))
-    stack = Stack(programs, folder, on_line=printer([program.name for program in programs]))
-    try:
-        stack.start()
+    with Stack(programs, folder, on_line=printer([program.name for program in programs])) as stack:
         with visit() as graph:
             stack.wait_until_ready(graph.visible_nodes, arguments.ready_timeout)
-        names = ", ".join(launch.name for launch in launches)
-        print(f"ready in ROS domain {os.environ['ROS_DOMAIN_ID']}: {names}. Logs: {folder}. Ctrl-C stops all.", flush=True)
+        print(f"ready in ROS domain {os.environ['ROS_DOMAIN_ID']}: {', '.join(nodes)}. Logs: {folder}. Ctrl-C stops all.", flush=True)
         stack.wait()
         stack.raise_if_ended()
-    finally:
-        stack.stop()
 
 
 def own_folder() -> Path:

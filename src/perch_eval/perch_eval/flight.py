@@ -40,11 +40,9 @@ class States:
 
     def at(self, times: np.ndarray) -> States:
         """The states at given times; vectors are interpolated, the attitude is that of the next sample."""
-        def between(values: np.ndarray) -> np.ndarray:
-            return interpolated(times, self.t, values)
-
         following = np.clip(np.searchsorted(self.t, times), 0, len(self.t) - 1)
-        return States(np.asarray(times), between(self.p), self.q[following], between(self.v), between(self.w))
+        p, v, w = (interpolated(times, self.t, values) for values in (self.p, self.v, self.w))
+        return States(np.asarray(times), p, self.q[following], v, w)
 
 
 def interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:

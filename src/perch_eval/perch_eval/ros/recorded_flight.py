@@ -14,8 +14,6 @@ from perch_eval.flight import Flight, time_of
 from perch_eval.mcap_log import McapLog, read
 from perch_eval.ros.definitions import schema_of, type_name
 
-Timed = list[tuple[float, Any]]
-
 
 class RecordedFlight(Flight):
     """The flight of an MCAP file, as the recorder or rosbag2 writes them. Only channels of `perch_core.ros.topics` are read."""
@@ -36,7 +34,7 @@ class RecordedFlight(Flight):
                 self._undecoded.setdefault(key, (channel, []))[1].append((time, data))
         super().__init__({key: [] for key in self._undecoded}, str(path), damage[0] if damage else "")
 
-    def values(self, channel: str) -> Timed:
+    def values(self, channel: str) -> list[tuple[float, Any]]:
         """As of any flight."""
         if channel in self._undecoded:
             self._channels[channel] = list(_decoded(*self._undecoded[channel]))

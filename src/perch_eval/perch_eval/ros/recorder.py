@@ -20,7 +20,6 @@ CHANNELS = (
     "rates_thrust_command", "attitude_thrust_command",
     "odometry", "vio/odometry", "estimator/status", "target/pose", "target/detections", "powerlines", "trajectory", "recovery", "controller/command",
     "controller/status", "controller/reference", "/diagnostics", "/tf", "/tf_static", "robot_description")
-SECOND = NANOSECONDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +46,7 @@ class Recorder(Listener[RecorderParameters]):
         super().__init__(config)
         self._log: McapLog | None = None
         self._last_image: dict[str, int] = {}
-        self._messages, self._told = 0, -SECOND
+        self._messages, self._told = 0, -NANOSECONDS
         self._failure = ""
 
     def warm_up(self) -> None:
@@ -71,10 +70,8 @@ class Recorder(Listener[RecorderParameters]):
             return
         self._last_image[camera] = image.stamp
         packed = jpeg(image, self.config.image_quality)
-        if packed is None:
-            return
-        channel = f"camera_{camera}/image_raw/compressed"
-        self._write(self.serialized(channel, packed))
+        if packed is not None:
+            self._write(self.serialized(f"camera_{camera}/image_raw/compressed", packed))
 
     def on_flush(self, now: int) -> None:
         """Hand to the operating system what is finished, and tell how it goes."""
@@ -83,7 +80,7 @@ class Recorder(Listener[RecorderParameters]):
                 self._log.flush()
             except OSError as error:
                 self._give_up(error)
-        if self.newest - self._told >= SECOND:
+        if self.newest - self._told >= NANOSECONDS:
             self._told = self.newest
             level, message = (2, self._failure) if self._failure else (0, "ok")
             self.diagnostics(Diagnostics(self.newest, {"messages": self._messages}, level, message))
