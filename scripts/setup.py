@@ -6,9 +6,7 @@ Every other script here does this by itself when it has to; this one does nothin
 
 from __future__ import annotations
 
-import sys
-
-from perch_setup import EXTRAS, ROOT, SetupError, command_parser, prepare
+from perch_setup import EXTRAS, ROOT, command_parser, prepare, setting_up
 
 EXAMPLES = """examples:
   python3 scripts/setup.py            set up what is missing or out of date
@@ -18,7 +16,7 @@ EXAMPLES = """examples:
 """
 
 
-def main() -> int:
+def main() -> None:
     """Set up and say how to go on."""
     parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("--clean", action="store_true", help="remove .venv, build and install first")
@@ -26,18 +24,11 @@ def main() -> int:
                         help="packages that are otherwise installed by the script that needs them; repeatable")
     parser.add_argument("--all", action="store_true", help="all of these")
     arguments = parser.parse_args()
-    try:
+    with setting_up():
         platform = prepare(arguments.clean, EXTRAS if arguments.all else arguments.extra)
-    except SetupError as error:
-        print(f"perch: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("\nperch set-up: interrupted; the next start goes on from here", file=sys.stderr)
-        return 130
     source = "the ROS wheels of PyPI" if platform.uses_wheels else "the ROS installation"
     print(f"perch is set up with {source}. A shell in which it works:  source {ROOT / 'setup.bash'}")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -39,18 +39,25 @@ def enter(*extras: str) -> None:
         with quiet_on_interrupt():
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         return
-    try:
+    with setting_up():
         environment = variables(prepare(extras=() if _HELP & set(sys.argv) else extras))
+    environment[_ENTERED] = str(os.getpid())
+    sys.stdout.flush()
+    sys.stderr.flush()
+    become(str(VENV_PYTHON), [str(VENV_PYTHON), *sys.argv], environment)
+
+
+@contextmanager
+def setting_up() -> Iterator[None]:
+    """A set-up that cannot be done, or is interrupted, ends the script with one line."""
+    try:
+        yield
     except SetupError as error:
         print(f"perch: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         print("\nperch set-up: interrupted; the next start goes on from here", file=sys.stderr)
         sys.exit(INTERRUPTED)
-    environment[_ENTERED] = str(os.getpid())
-    sys.stdout.flush()
-    sys.stderr.flush()
-    become(str(VENV_PYTHON), [str(VENV_PYTHON), *sys.argv], environment)
 
 
 def become(path: str, arguments: list[str], environment: Mapping[str, str] = os.environ) -> NoReturn:
