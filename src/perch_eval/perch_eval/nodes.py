@@ -72,14 +72,12 @@ def node_programs(launches: Sequence[NodeLaunch], folder: Path, *, namespace: st
             raise PerchError(f"node {name!r} is not one of {', '.join(NODES)}")
     arguments = {launch.name: ros_arguments(launch, folder, namespace) for launch in launches}
     together = [launch for launch in launches if launch.name in composed]
-    found = []
+    found, prefix = [], namespace.rstrip("/")
     if together:
         plan = folder / "composed.json"
         plan.write_text(json.dumps([{"name": n.name, "module": n.module, "arguments": arguments[n.name]} for n in together], indent=1))
-        found.append(Program("composed", (executable("perch_eval", "composed"), str(plan)),
-                             tuple(qualified_name(n.name, namespace) for n in together)))
-    found += [Program(n.name, (executable(n.package, n.name), *arguments[n.name]), (qualified_name(n.name, namespace),))
-              for n in launches if n not in together]
+        found.append(Program("composed", (executable("perch_eval", "composed"), str(plan)), tuple(f"{prefix}/{n.name}" for n in together)))
+    found += [Program(n.name, (executable(n.package, n.name), *arguments[n.name]), (f"{prefix}/{n.name}",)) for n in launches if n not in together]
     return tuple(found)
 
 
@@ -108,8 +106,3 @@ def in_namespace(namespace: str) -> list[str]:
     if not namespace.strip("/"):
         return []
     return ["-r", f"__ns:={namespace}", *(word for topic in PER_VEHICLE for word in ("-r", f"{topic}:={topic.lstrip('/')}"))]
-
-
-def qualified_name(node: str, namespace: str = "") -> str:
-    """Fully qualified name of a node in the graph."""
-    return f"{namespace.rstrip('/')}/{node}"

@@ -90,7 +90,7 @@ def slope(values: Sequence[float]) -> float | None:
 
 
 def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: float, flights: int | None, folder: Path,
-        keep: Callable[[Sequence[Flight]], object] = lambda _: None) -> list[Flight]:
+        keep: Callable[[Sequence[Flight]], object]) -> list[Flight]:
     """Fly until there has been so much simulated time, or so many flights.
 
     Args:

@@ -176,7 +176,7 @@ class MissionClient(GraphNode):
             outcome = "timeout"
         return FlightResult(outcome, answer.message, answer.end_time or self.time, time.monotonic() - progress.began, progress.start)
 
-    def depart(self, check: Callable[[], None] = lambda: None) -> tuple[bool, str]:
+    def depart(self, check: Callable[[], None]) -> tuple[bool, str]:
         """Have a perched vehicle leave for a hover.
 
         Args:
