@@ -10,7 +10,7 @@ from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit, visit
+from ros_graph.connection import Visit
 from ros_graph.messages import fill, interface, parse, to_yaml
 
 _STATUS = {
@@ -20,42 +20,40 @@ _STATUS = {
 }
 
 
-def call_service(arguments: argparse.Namespace) -> int:
+def call_service(graph: Visit, arguments: argparse.Namespace) -> int:
     """`service.py call`: prints the response; 1 where it says `success: false`."""
     cls = interface(arguments.type, "srv")
     request = fill(cls.Request(), parse(arguments.values, "request"))
-    with visit() as graph:
-        service = graph.absolute(arguments.service)
-        client = graph.node.create_client(cls, service)
-        if not graph.spin_until(client.service_is_ready, arguments.spin_time):
-            raise GraphError(f"service {service} does not exist with type {arguments.type}; 'service.py list -t' shows all")
-        response = graph.answer(client.call_async(request), service, timeout=30.0)
+    service = graph.absolute(arguments.service)
+    client = graph.node.create_client(cls, service)
+    if not graph.spin_until(client.service_is_ready, arguments.spin_time):
+        raise GraphError(f"service {service} does not exist with type {arguments.type}; 'service.py list -t' shows all")
+    response = graph.answer(client.call_async(request), service, timeout=30.0)
     sys.stdout.write(to_yaml(response))
     return 0 if getattr(response, "success", True) else 1
 
 
-def send_goal(arguments: argparse.Namespace) -> int:
+def send_goal(graph: Visit, arguments: argparse.Namespace) -> int:
     """`action.py send_goal`: 0 where the goal succeeds, 1 where it does not. Ctrl-C cancels the goal."""
     cls = interface(arguments.type, "action")
     goal = fill(cls.Goal(), parse(arguments.values, "goal"))
-    with visit() as graph:
-        action = graph.absolute(arguments.action)
-        client = ActionClient(graph.node, cls, action)
-        if not graph.spin_until(client.server_is_ready, arguments.spin_time):
-            raise GraphError(f"action {action} does not exist with type {arguments.type}; 'action.py list -t' shows all")
+    action = graph.absolute(arguments.action)
+    client = ActionClient(graph.node, cls, action)
+    if not graph.spin_until(client.server_is_ready, arguments.spin_time):
+        raise GraphError(f"action {action} does not exist with type {arguments.type}; 'action.py list -t' shows all")
 
-        def show(message) -> None:
-            sys.stdout.write(f"feedback:\n{_indented(to_yaml(message.feedback))}")
-            sys.stdout.flush()
+    def show(message) -> None:
+        sys.stdout.write(f"feedback:\n{_indented(to_yaml(message.feedback))}")
+        sys.stdout.flush()
 
-        sent = client.send_goal_async(goal, feedback_callback=show if arguments.feedback else None)
-        handle = graph.answer(sent, action)
-        if not handle.accepted:
-            print("goal rejected")
-            return 1
-        print("goal accepted", flush=True)
-        outcome = _result(graph, handle)
-        client.destroy()
+    sent = client.send_goal_async(goal, feedback_callback=show if arguments.feedback else None)
+    handle = graph.answer(sent, action)
+    if not handle.accepted:
+        print("goal rejected")
+        return 1
+    print("goal accepted", flush=True)
+    outcome = _result(graph, handle)
+    client.destroy()
     status = _STATUS.get(outcome.status, f"UNKNOWN ({outcome.status})")
     sys.stdout.write(f"result:\n{_indented(to_yaml(outcome.result))}goal finished: {status}\n")
     return 0 if outcome.status == GoalStatus.STATUS_SUCCEEDED else 1

@@ -33,7 +33,7 @@ class Commands:
 
         Args:
             name: on the command line.
-            handler: `module:function` in this package, which is imported inside the environment only; it takes the arguments.
+            handler: `module:function` in this package, which is imported inside the environment only; it takes a visit to the graph, and the arguments.
             about: what it does.
         """
         command = self._verbs.add_parser(name, help=about)
@@ -73,11 +73,14 @@ def carry_out(command_line: argparse.ArgumentParser) -> int:
     """
     arguments = command_line.parse_args()
     enter()
-    from perch_core.errors import PerchError  # there is one inside the environment only
+    from perch_core.errors import PerchError  # as rclpy, inside the environment only
 
     module, function = arguments.handler.split(":")
     try:
-        code = getattr(importlib.import_module(f"ros_graph.{module}"), function)(arguments)
+        from ros_graph.connection import visit
+
+        with visit() as graph:
+            code = getattr(importlib.import_module(f"ros_graph.{module}"), function)(graph, arguments)
         sys.stdout.flush()
         return code
     except (GraphError, PerchError) as error:

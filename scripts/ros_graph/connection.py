@@ -67,12 +67,11 @@ def hidden(name: str) -> bool:
     return any(part.startswith("_") for part in name.split("/"))
 
 
-def list_names(arguments: argparse.Namespace) -> int:
+def list_names(graph: Visit, arguments: argparse.Namespace) -> int:
     """`list`: prints the names of a kind that are not hidden, with their types where that is asked for (`-t`)."""
     observe = {"topics": Node.get_topic_names_and_types, "services": Node.get_service_names_and_types,
                "actions": get_action_names_and_types}[arguments.kind]
-    with visit() as graph:
-        found = graph.settle(lambda: observe(graph.node), arguments.spin_time)
+    found = graph.settle(lambda: observe(graph.node), arguments.spin_time)
     for name, types in sorted(found):
         if not hidden(name):
             print(f"{name} [{', '.join(types)}]" if arguments.show_types else name)

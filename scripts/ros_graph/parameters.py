@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import yaml
@@ -14,40 +12,39 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit, hidden, visit
+from ros_graph.connection import Visit, hidden
 
 TYPES = {getattr(ParameterType, f"PARAMETER_{kind.upper().replace(' ', '_')}"): kind for kind in (
     "bool", "integer", "double", "string", "byte array", "bool array", "integer array", "double array", "string array")}
 
 
-def list_parameters(arguments: argparse.Namespace) -> int:
+def list_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
     """`param.py list`: of one node, or of all."""
-    with visit() as graph:
-        nodes = [graph.absolute(arguments.node)] if arguments.node else _nodes(graph, arguments.spin_time)
-        for node in nodes:
-            names = _names(graph, _client(graph, node, arguments.spin_time), node)
-            print(f"{node}:")
-            print("".join(f"  {name}\n" for name in names), end="")
+    nodes = [graph.absolute(arguments.node)] if arguments.node else _nodes(graph, arguments.spin_time)
+    for node in nodes:
+        names = _names(graph, _client(graph, node, arguments.spin_time), node)
+        print(f"{node}:")
+        print("".join(f"  {name}\n" for name in names), end="")
     return 0
 
 
-def get_parameter(arguments: argparse.Namespace) -> int:
+def get_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
     """`param.py get`"""
-    with _node(arguments) as (graph, node, client):
-        value = _values(graph, client, node, [arguments.parameter])[0]
-        if value.type == ParameterType.PARAMETER_NOT_SET:
-            raise GraphError(f"{node} has no parameter {arguments.parameter!r}; 'param.py list {node}' shows all")
-        shown = _plain(parameter_value_to_python(value))
-        print(shown if not isinstance(shown, str) else repr(shown))
+    node, client = _node(graph, arguments)
+    value = _values(graph, client, node, [arguments.parameter])[0]
+    if value.type == ParameterType.PARAMETER_NOT_SET:
+        raise GraphError(f"{node} has no parameter {arguments.parameter!r}; 'param.py list {node}' shows all")
+    shown = _plain(parameter_value_to_python(value))
+    print(shown if not isinstance(shown, str) else repr(shown))
     return 0
 
 
-def describe_parameters(arguments: argparse.Namespace) -> int:
+def describe_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
     """`param.py describe`: what each parameter means, its type and unit, and what is allowed."""
-    with _node(arguments) as (graph, node, client):
-        names = [arguments.parameter] if arguments.parameter else _names(graph, client, node)
-        values = _values(graph, client, node, names)
-        found = graph.answer(client.describe_parameters(names), node).descriptors
+    node, client = _node(graph, arguments)
+    names = [arguments.parameter] if arguments.parameter else _names(graph, client, node)
+    values = _values(graph, client, node, names)
+    found = graph.answer(client.describe_parameters(names), node).descriptors
     for name, value, descriptor in zip(names, values, found):
         if value.type == ParameterType.PARAMETER_NOT_SET and not descriptor.description:
             raise GraphError(f"{node} has no parameter {name!r}; 'param.py list {node}' shows all")
@@ -71,21 +68,21 @@ def _allowed(descriptor: ParameterDescriptor) -> str:
     return ", ".join(parts)
 
 
-def set_parameter(arguments: argparse.Namespace) -> int:
+def set_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
     """`param.py set`: 1 where the node refuses the value."""
     value = parse_yaml(arguments.value, "value")
-    with _node(arguments) as (graph, node, client):
-        name = arguments.parameter
-        present = _values(graph, client, node, [name])[0]
-        if present.type == ParameterType.PARAMETER_DOUBLE and type(value) is int:
-            value = float(value)
-        if present.type == ParameterType.PARAMETER_DOUBLE_ARRAY and isinstance(value, list):
-            value = [float(item) if type(item) is int else item for item in value]
-        try:
-            parameter = Parameter(name, value=value)
-        except (TypeError, ValueError, AssertionError):
-            raise GraphError(f"{name}: {value!r} is not a value that a parameter can have") from None
-        result = graph.answer(client.set_parameters([parameter]), node).results[0]
+    node, client = _node(graph, arguments)
+    name = arguments.parameter
+    present = _values(graph, client, node, [name])[0]
+    if present.type == ParameterType.PARAMETER_DOUBLE and type(value) is int:
+        value = float(value)
+    if present.type == ParameterType.PARAMETER_DOUBLE_ARRAY and isinstance(value, list):
+        value = [float(item) if type(item) is int else item for item in value]
+    try:
+        parameter = Parameter(name, value=value)
+    except (TypeError, ValueError, AssertionError):
+        raise GraphError(f"{name}: {value!r} is not a value that a parameter can have") from None
+    result = graph.answer(client.set_parameters([parameter]), node).results[0]
     if not result.successful:
         print(f"{node} refused {name}: {result.reason}")
         return 1
@@ -93,23 +90,21 @@ def set_parameter(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def dump_parameters(arguments: argparse.Namespace) -> int:
+def dump_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
     """`param.py dump`: as a parameter file."""
-    with _node(arguments) as (graph, node, client):
-        names = _names(graph, client, node)
-        values = _values(graph, client, node, names)
+    node, client = _node(graph, arguments)
+    names = _names(graph, client, node)
+    values = _values(graph, client, node, names)
     known = {name: value for name, value in zip(names, values) if value.type != ParameterType.PARAMETER_NOT_SET}
     tree = nested({name: _plain(parameter_value_to_python(value)) for name, value in known.items()})
     print(yaml.safe_dump({node: {"ros__parameters": tree}}, sort_keys=False), end="")
     return 0
 
 
-@contextmanager
-def _node(arguments: argparse.Namespace) -> Iterator[tuple[Visit, str, AsyncParameterClient]]:
-    """A visit to the node of the command line: the graph, the node's full name, a client of its parameters."""
-    with visit() as graph:
-        name = graph.absolute(arguments.node)
-        yield graph, name, _client(graph, name, arguments.spin_time)
+def _node(graph: Visit, arguments: argparse.Namespace) -> tuple[str, AsyncParameterClient]:
+    """The node of the command line: its full name, and a client of its parameters."""
+    name = graph.absolute(arguments.node)
+    return name, _client(graph, name, arguments.spin_time)
 
 
 def _nodes(graph: Visit, timeout: float) -> list[str]:

@@ -14,27 +14,26 @@ from typing import Any
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit, visit
+from ros_graph.connection import Visit
 from ros_graph.messages import fill, interface, parse, pick, to_yaml
 
 REPORT_PERIOD = 1.0  # of `hz` [s]
 
 
-def show_info(arguments: argparse.Namespace) -> int:
+def show_info(graph: Visit, arguments: argparse.Namespace) -> int:
     """`topic.py info`"""
-    with visit() as graph:
-        topic = graph.absolute(arguments.topic)
-        name = topic_type(graph, topic, arguments.spin_time)
-        sides = graph.settle(lambda: _sides(graph, topic), arguments.spin_time)
-        print(f"Type: {name}\n")
-        for side, endpoints in sides.items():
-            print(f"{side} count: {len(endpoints)}")
-            if arguments.verbose:
-                print("\n" + "\n".join(endpoints) + "\n")
+    topic = graph.absolute(arguments.topic)
+    name = topic_type(graph, topic, arguments.spin_time)
+    sides = graph.settle(lambda: _sides(graph, topic), arguments.spin_time)
+    print(f"Type: {name}\n")
+    for side, endpoints in sides.items():
+        print(f"{side} count: {len(endpoints)}")
+        if arguments.verbose:
+            print("\n" + "\n".join(endpoints) + "\n")
     return 0
 
 
-def echo(arguments: argparse.Namespace) -> int:
+def echo(graph: Visit, arguments: argparse.Namespace) -> int:
     """`topic.py echo`"""
     wanted = 1 if arguments.once else arguments.n or math.inf
     shown = 0
@@ -52,15 +51,14 @@ def echo(arguments: argparse.Namespace) -> int:
             problem.append(error)
         shown += 1
 
-    with visit() as graph:
-        _subscribe(graph, arguments, show)
-        graph.spin_until(lambda: problem or shown >= wanted)
+    _subscribe(graph, arguments, show)
+    graph.spin_until(lambda: problem or shown >= wanted)
     if problem:
         raise problem[0]
     return 0
 
 
-def measure_rate(arguments: argparse.Namespace) -> int:
+def measure_rate(graph: Visit, arguments: argparse.Namespace) -> int:
     """`topic.py hz`: prints the rate every second; with `-n`, ends after so many messages."""
     arrivals: deque[float] = deque(maxlen=max(arguments.window, 2))
     wanted, count, reported = arguments.n or math.inf, 0, 0
@@ -70,12 +68,11 @@ def measure_rate(arguments: argparse.Namespace) -> int:
         count += 1
         arrivals.append(time.monotonic())
 
-    with visit() as graph:
-        _subscribe(graph, arguments, arrived, raw=True)  # counting does not need the content of an image
-        while count < wanted:
-            finished = graph.spin_until(lambda: count >= wanted, REPORT_PERIOD)
-            print(rate_summary(list(arrivals)) if count > reported or finished else "no new messages", flush=True)
-            reported = count
+    _subscribe(graph, arguments, arrived, raw=True)  # counting does not need the content of an image
+    while count < wanted:
+        finished = graph.spin_until(lambda: count >= wanted, REPORT_PERIOD)
+        print(rate_summary(list(arrivals)) if count > reported or finished else "no new messages", flush=True)
+        reported = count
     return 0
 
 
@@ -96,20 +93,19 @@ def rate_summary(arrivals: Sequence[float]) -> str:
     )
 
 
-def publish(arguments: argparse.Namespace) -> int:
+def publish(graph: Visit, arguments: argparse.Namespace) -> int:
     """`topic.py pub`"""
     message = fill(interface(arguments.type, "msg")(), parse(arguments.values, "message"))
-    with visit() as graph:
-        topic = graph.absolute(arguments.topic)
-        publisher = graph.node.create_publisher(type(message), topic, 10)
-        if arguments.once and not graph.spin_until(lambda: publisher.get_subscription_count() > 0, arguments.spin_time):
-            raise GraphError(f"topic {topic} has no subscribers")
+    topic = graph.absolute(arguments.topic)
+    publisher = graph.node.create_publisher(type(message), topic, 10)
+    if arguments.once and not graph.spin_until(lambda: publisher.get_subscription_count() > 0, arguments.spin_time):
+        raise GraphError(f"topic {topic} has no subscribers")
+    publisher.publish(message)
+    while not arguments.once:
+        due = time.monotonic() + 1.0 / arguments.rate
+        graph.spin_until(lambda: time.monotonic() >= due)  # noqa: B023 (called in this turn)
         publisher.publish(message)
-        while not arguments.once:
-            due = time.monotonic() + 1.0 / arguments.rate
-            graph.spin_until(lambda: time.monotonic() >= due)  # noqa: B023 (called in this turn)
-            publisher.publish(message)
-        publisher.wait_for_all_acked()
+    publisher.wait_for_all_acked()
     print(f"published one message on {topic}")
     return 0
 

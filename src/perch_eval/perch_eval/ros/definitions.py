@@ -39,9 +39,5 @@ def message_definition(name: str) -> str:
             collect(f"{inner_package}/msg/{inner}")
 
     collect(name)
-    first, *rest = seen
-    parts = [seen[first]]
-    for full in rest:
-        package, _, short = full.split("/")
-        parts += ["=" * 80, f"MSG: {package}/{short}", seen[full]]
-    return "\n".join(parts)
+    own = seen.pop(name)
+    return "\n".join([own, *(f"{'=' * 80}\nMSG: {full.replace('/msg/', '/')}\n{text}" for full, text in seen.items())])
