@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 from perch_core.ros import topics
-from perch_core.values import CameraImage, ControllerStatus, MotorCommand, OdometryState, Serialized, TrajectoryOrder
+from perch_core.values import NANOSECONDS, CameraImage, ControllerStatus, MotorCommand, OdometryState, Serialized, TrajectoryOrder
 from perch_core.trajectory import rest_to_rest
 from perch_eval.flight import Flight, timed
 from perch_eval.mcap_log import read
@@ -159,11 +159,14 @@ def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path, monkeyp
     monkeypatch.setattr("builtins.open", opened)
     said = []
     recording.recorder.diagnostics.receivers.append(said.append)
-    recording.fly(range(20000))
+    recording.fly(range(10))
     recording.recorder.on_flush(0)
+    recording.fly(range(10, 20000))
+    recording.recorder.on_flush(NANOSECONDS)
     recording.recorder.close()
     assert [line.level for line in recording.lines] == ["error"] and "No space left" in recording.lines[0].text
-    assert said[-1].level == 2 and "No space left" in said[-1].message
+    assert [s.level for s in said] == [0, 2]
+    assert "No space left" in said[-1].message
     flight = RecordedFlight(path)
     count = len(flight.values("odometry"))
     assert flight.damage and 100 < count < 20000

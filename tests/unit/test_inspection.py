@@ -17,7 +17,7 @@ from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.inspection.flight import fly
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.layout import random_layout
-from perch_eval.inspection.measures import collisions, inspected, judge, reference_of, reference_states, segments, watched
+from perch_eval.inspection.measures import clearance, collisions, inspected, judge, reference_of, reference_states, segments, watched
 from perch_control.mission.parameters import MissionParameters
 from perch_control.parameters import ControllerParameters
 from perch_sim.scenario import Scenario, Start, Waypoint, load_scenario
@@ -57,15 +57,15 @@ def test_layouts_repeat_and_their_reference_collides_twice_and_looks_past_the_li
     assert layout == random_layout(BASE, seed)
     assert layout.world.cables != random_layout(BASE, seed + 10).world.cables
     states, lines = reference_states(layout)[1], segments(layout)
-    assert collisions(states, lines, RADII) == 2
+    assert collisions(clearance(states, lines, RADII)) == 2
     assert judge(states, lines, watched(layout, lines), load_vehicle("rpg")).reprojection > 60.0
-    assert collisions(states[[0, -1]], lines, RADII) == 0
+    assert collisions(clearance(states[[0, -1]], lines, RADII)) == 0
 
 
 def test_collisions_are_counted_by_their_beginnings():
     states = np.tile([0.0, 0, 0, 0, 0, 0, 1.0], (5, 1))
     states[:, 0] = [0.0, 1.0, 0.0, 0.1, 1.0]
-    assert collisions(states, [Segment.between((0.0, -1, 0), (0.0, 1, 0), 0.03)], RADII) == 2
+    assert collisions(clearance(states, [Segment.between((0.0, -1, 0), (0.0, 1, 0), 0.03)], RADII)) == 2
 
 
 def test_a_scenario_says_what_its_nodes_fly():

@@ -22,14 +22,12 @@ class SentGoal:
     Attributes:
         value: what is asked for.
         cancel_requested: it shall end.
-        rejected: why the mission does not take it; empty: it does.
         result: how it ended; None: it has not.
     """
 
     def __init__(self, value: PerchGoal, told: Callable[[Any], None]) -> None:
         self.value, self.feedback = value, told
         self.cancel_requested = False
-        self.rejected = ""
         self.result: PerchResult | None = None
 
     def finish(self, ending: str, result: PerchResult) -> None:
@@ -124,7 +122,7 @@ class Loop:
                 self.trace.phases.append((self.time, *now))
 
         sent = SentGoal(goal, told)
-        self._participants[name].goal("perch", sent, lambda why: setattr(sent, "rejected", why))
+        self._participants[name].goal("perch", sent)
         return sent
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from perch_core.arrays import Vector3
 from perch_core.lines import Segment, scaled_clearance, segment_distance
 from perch_core.vehicle import load_vehicle
-from perch_eval.inspection.measures import collisions, reference_states, segments
+from perch_eval.inspection.measures import clearance, collisions, reference_states, segments
 from perch_sim.scenario import Cable, Scenario, Start, Waypoint
 
 RADIUS = 0.03           # of the cables [m]
@@ -40,10 +40,9 @@ def random_layout(base: Scenario, seed: int) -> Scenario:
     for _ in range(DRAWS):
         scenario = _draw(base, rng)
         cables = segments(scenario)
-        states = reference_states(scenario)[1]
-        clear = min(float(scaled_clearance(states[[0, -1], 0:3], states[[0, -1], 3:7], c, vehicle.body_radii).min()) for c in cables)
+        clear = clearance(reference_states(scenario)[1], cables, vehicle.body_radii)
         apart = min(segment_distance(a, b) for k, a in enumerate(cables) for b in cables[:k])
-        if apart > APART and clear > CLEAR and _way_up(scenario, cables, vehicle.body_radii) and collisions(states, cables, vehicle.body_radii) == 2:
+        if apart > APART and min(clear[0], clear[-1]) > CLEAR and _way_up(scenario, cables, vehicle.body_radii) and collisions(clear) == 2:
             return dataclasses.replace(scenario, name=f"{base.name}_{seed}")
     raise RuntimeError(f"no layout within {DRAWS} draws of seed {seed}")
 

@@ -52,9 +52,9 @@ def clearance(states: np.ndarray, lines: Sequence[Segment], radii: Vector3) -> n
     return np.min([scaled_clearance(states[:, 0:3], states[:, 3:7], line, radii) for line in lines], axis=0)
 
 
-def collisions(states: np.ndarray, lines: Sequence[Segment], radii: Vector3) -> int:
-    """How often a line enters the body."""
-    inside = np.concatenate([[False], clearance(states, lines, radii) < 0.0])
+def collisions(clear: np.ndarray) -> int:
+    """How often a line enters the body, from clearances, shape (n,)."""
+    inside = np.concatenate([[False], clear < 0.0])
     return int(np.count_nonzero(~inside[:-1] & inside[1:]))
 
 
@@ -65,14 +65,17 @@ class Judgement:
     Attributes:
         clearance: scaled clearance of the nearest line, shape (n,). [P:eq7]
         seen: measures of the watched line, n states.
-        collisions: how often a line enters the body.
         corner: distance of the image's corners from its centre [px].
     """
 
     clearance: np.ndarray
     seen: Visibility
-    collisions: int
     corner: float
+
+    @property
+    def collisions(self) -> int:
+        """How often a line enters the body."""
+        return collisions(self.clearance)
 
     @property
     def reprojection(self) -> float:
@@ -85,7 +88,7 @@ def judge(states: np.ndarray, lines: Sequence[Segment], line: Segment, vehicle: 
     """Judge states p, q, ..., shape (n, >= 7), against the true lines, of which `line` is to be watched."""
     mount = vehicle.mounts["front"]
     return Judgement(clearance(states, lines, vehicle.body_radii), visibility(states, line, mount),
-                     collisions(states, lines, vehicle.body_radii), float(np.hypot(mount.camera.width, mount.camera.height)) / 2)
+                     float(np.hypot(mount.camera.width, mount.camera.height)) / 2)
 
 
 @dataclass(frozen=True)

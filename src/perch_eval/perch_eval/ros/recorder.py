@@ -58,8 +58,7 @@ class Recorder(Listener[RecorderParameters]):
 
     def on_message(self, channel: str, message: Serialized) -> None:
         """Put a message on file."""
-        if self._log is not None:
-            self._write(self.serialized(channel, message))
+        self._write(self.serialized(channel, message))
 
     def on_image(self, camera: str, image: CameraImage) -> None:
         """Put one of some images on file. `image_rate` counts by stamps."""
@@ -80,8 +79,8 @@ class Recorder(Listener[RecorderParameters]):
                 self._log.flush()
             except OSError as error:
                 self._give_up(error)
-        if self.newest - self._told >= NANOSECONDS:
-            self._told = self.newest
+        if now - self._told >= NANOSECONDS:
+            self._told = now
             level, message = (2, self._failure) if self._failure else (0, "ok")
             self.diagnostics(Diagnostics(self.newest, {"messages": self._messages}, level, message))
 
