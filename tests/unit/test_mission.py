@@ -239,6 +239,20 @@ def test_a_departure_without_a_plan_arms_until_the_controller_does():
     assert world.commands == 3 * [Command.ARM] and world.queries == 1
 
 
+def test_a_target_that_was_lost_has_to_be_in_view_for_as_long_again():
+    world = reached(Phase.SEARCHING)
+    while world.machine.message != "target in view":
+        world.tick()
+    for _ in range(10):
+        world.tick()
+    world.sees = False
+    world.tick()
+    world.sees, again = True, world.time
+    while world.queries == 0:
+        world.tick()
+    assert world.time - again > world.machine.settings.target_settle
+
+
 def test_no_target_ends_in_a_hover_after_the_pattern():
     world = World(sees=False)
     world.run()

@@ -59,7 +59,9 @@ class Assembly:
 
     def restart(self) -> None:
         """A new flight, on the ground, with the law that flies now."""
-        self._begin(self.flown, self.flight.compensator is not None)
+        flown = self.flown
+        self.laws[flown].begin()
+        self._begin(flown, self.flight.compensator is not None)
 
     def _begin(self, law: str, adaptive: bool) -> None:
         self.flight = FlightController(self.vehicle, self.laws[law], self._params.gain_set, self._params.flight)

@@ -178,6 +178,7 @@ class MissionMachine(ABC):
             if inputs.time - self._seen_since >= self.settings.target_settle and self._moves.arrived(inputs.time, inputs.state):
                 self.at_target(inputs, outputs, target)
             return
+        self._seen_since = None
         if self._elapsed(inputs) > self._goal.search_timeout:
             self._end(outputs, Result.NOT_FOUND, f"no target within {self._goal.search_timeout:g} s: {why}")
             return
