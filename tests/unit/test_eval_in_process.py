@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 
 from perch_core.errors import PerchError
-from perch_core.vehicle import load_vehicle
 from perch_eval.in_process import Sensing, arrange, fly
 from perch_eval.in_process.flights import perch
 from closed_loop.truth import TruthEstimator
@@ -56,11 +55,10 @@ def test_another_seed_is_another_flight(flown):
 
 
 def test_a_recording_of_a_flight_has_its_digest_and_its_figures(flown, tmp_path):
-    scenario, trace = load_scenario("surface_90"), flown
-    write(tmp_path / "flight.mcap", trace.timeline())
-    recorded, vehicle = RecordedFlight(tmp_path / "flight.mcap"), load_vehicle(scenario.vehicle)
-    assert recorded.digest(trace.end_time) == trace.flight.digest(trace.end_time)
-    assert flight_metrics(recorded, vehicle, trace.end_time) == flight_metrics(trace.flight, vehicle, trace.end_time)
+    write(tmp_path / "flight.mcap", flown.timeline())
+    recorded = RecordedFlight(tmp_path / "flight.mcap")
+    assert recorded.digest(flown.end_time) == flown.flight.digest(flown.end_time)
+    assert flight_metrics(recorded, flown.end_time) == flight_metrics(flown.flight, flown.end_time)
 
 
 def test_what_has_no_error_model_is_refused():

@@ -40,13 +40,12 @@ def test_a_recording_is_the_flight_that_was_flown(recorded):
     for field in "tpqvw":
         assert np.array_equal(getattr(found.states("odometry"), field), getattr(flight.states("odometry"), field))
         assert np.array_equal(getattr(found.reference(), field), getattr(flight.reference(), field))
-    vehicle = load_vehicle("snapdragon")
-    assert flight_metrics(found, vehicle, 4.0) == flight_metrics(flight, vehicle, 4.0)
+    assert flight_metrics(found, 4.0) == flight_metrics(flight, 4.0)
 
 
 def test_figures_are_what_was_put_in(recorded):
     _, flight = recorded
-    found = flight_metrics(flight, load_vehicle("snapdragon"), 4.0)
+    found = flight_metrics(flight, 4.0)
     assert perch_window(flight) == (1.5, 3.4) and found["perch_planned"]
     assert found["estimation_rmse_m"] == pytest.approx(np.abs(BIAS), abs=1e-9) and found["velocity_rmse_m_s"] == pytest.approx([0.0] * 3, abs=1e-9)
     assert found["tracking_rmse_m"] == pytest.approx([0.0] * 3, abs=1e-9) and found["target_error"] == pytest.approx({"position_m": 0.04, "attitude_deg": 0.0})
@@ -62,7 +61,7 @@ def test_figures_are_of_the_attempt_that_touched_and_of_what_is_known():
     channels["trajectory"] = timed([early, *(order for _, order in channels["trajectory"])])
     channels["odometry"] = [(t, state) for t, state in channels["odometry"] if t < 3.0]
     channels["controller/reference"] = [(t, state) for t, state in channels["controller/reference"] if not 2.0 < t < 2.4]
-    found = flight_metrics(Flight(channels), load_vehicle("snapdragon"), 4.0)
+    found = flight_metrics(Flight(channels), 4.0)
     assert found["window_s"] == [1.5, 3.4]
     assert found["estimation_rmse_m"] == pytest.approx(np.abs(BIAS), abs=1e-9) and "estimation_error_at_end_m" not in found
     assert found["tracking_rmse_m"] == pytest.approx([0.0] * 3, abs=1e-9)
@@ -70,7 +69,7 @@ def test_figures_are_of_the_attempt_that_touched_and_of_what_is_known():
 
 
 def test_rates_without_a_perch_are_not_compared_with_those_of_a_perch(recorded):
-    found = flight_metrics(recorded[1], load_vehicle("snapdragon"), 4.0)
+    found = flight_metrics(recorded[1], 4.0)
     assert "max_body_rate_deg_s" in figures(found, 4.0) and "max_acceleration_m_s2" in figures(found, 4.0)
     hover = figures(found | {"perch_planned": False}, 4.0)
     assert "max_body_rate_deg_s" not in hover and "max_acceleration_m_s2" not in hover

@@ -8,7 +8,8 @@ from math import hypot
 from perch_core.arrays import Numbers, Quaternion, Vector3, quaternion, vector3
 from perch_core.component import Component, Input, Output, Wake
 from perch_core.config import text
-from perch_core.urdf import BASE, fixed_frames, urdf
+from perch_core.static_transforms import BASE
+from perch_core.urdf import fixed_frames, urdf
 from perch_core.values import NANOSECONDS, OdometryState, StampedTransform, TargetPose, Transform
 from perch_core.vehicle import load_vehicle
 

@@ -11,10 +11,11 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.arrays import quaternion, vector3
+from perch_core.static_transforms import BASE
 from perch_core.vehicle import Vehicle
 from perch_core.values import Transform
 
-BASE, IMU = "base_link", "imu_link"
+IMU = "imu_link"
 ARM_WIDTH, ROTOR_HEIGHT, PLATE_HEIGHT = 0.012, 0.008, 0.006  # [m]
 ROTOR_RADIUS = 0.1  # where the vehicle's file does not tell [m]
 COLOURS = {"body": "0.25 0.25 0.25 0.6", "arm": "0.15 0.15 0.15 1", "front": "0.9 0.2 0.2 0.8", "rear": "0.25 0.25 0.25 0.8",

@@ -86,7 +86,7 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
     model = flew or load_vehicle("snapdragon")
     view = FlightView.of(flight, model, name, colour)
     until = report.get("simulated_time_s") or float(view.truth.t[-1])
-    report = {**report, **flight_metrics(flight, model, until), "flight_hash": report.get("flight_hash") or flight.digest(until)}
+    report = {**report, **flight_metrics(flight, until), "flight_hash": report.get("flight_hash") or flight.digest(until)}
     found = {one["name"]: one for one in report.get("margins", ()) if one.get("left") is not None}
     found |= {one.name: one.mapping() for one in margins(flight, model) if flew is not None}
     return Side(view, report | {"margins": list(found.values())}, flew is not None)

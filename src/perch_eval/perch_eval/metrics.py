@@ -85,12 +85,11 @@ def peak_acceleration(truth: States) -> float:
     return float(np.linalg.norm(dv / dt, axis=1).max())
 
 
-def flight_metrics(flight: Flight, vehicle: Vehicle, until: float) -> dict[str, Any]:
+def flight_metrics(flight: Flight, until: float) -> dict[str, Any]:
     """Tracking, estimation, rates, contact and timings of a flight.
 
     Args:
         flight: the recording.
-        vehicle: the vehicle that flew.
         until: end of the flight [s].
     """
     out: dict[str, Any] = {"contact": contact_report(flight)}

@@ -92,7 +92,7 @@ def fly_in_process(task: Task, measure: Measure = lambda *_: {}, linger: float =
     scenario = config.from_mapping(Scenario, task.scenario, f"run {task.run.number}")
     trace = fly(scenario, task.run.seed, task.sensing, 0.5 if task.keep else linger)
     vehicle = load_vehicle(scenario.vehicle)
-    metrics = figures(flight_metrics(trace.flight, vehicle, trace.end_time), trace.end_time)
+    metrics = figures(flight_metrics(trace.flight, trace.end_time), trace.end_time)
     if task.keep:
         from perch_eval.report import build_report  # and with it matplotlib and ROS: most workers keep no flight
         from perch_eval.ros.recorded_flight import write
