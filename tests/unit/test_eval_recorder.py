@@ -225,7 +225,7 @@ def test_how_it_goes_is_told_once_a_second_of_flight(tmp_path):
     for k in range(1000):
         recording.give("odometry", state(k))
         if k % 50 == 0:
-            recording.recorder.on_flush(0)
+            recording.recorder.on_flush(k * STEP)
     assert len(said) == 2 and said[-1].values["messages"] > 400
     recording.recorder.close()
 

@@ -26,7 +26,7 @@ def verdicts(section):
 def test_controllers_that_track_well_until_they_crash_fail(effort, monkeypatch, outcome, verdict):
     def rows(effort, name, jobs, work, good):
         return [{"controller": c, "condition": k, "maneuver": m, "seed": seed, "rmse": (0.01,) * 3 if "L1" in c else (0.04,) * 3,
-                 "outcome": control.GOOD_END[m] if outcome == "good" else outcome} for c, k, m, seed in jobs]
+                 "outcome": {"line": "held", "perch": "perched"}[m] if outcome == "good" else outcome} for c, k, m, seed in jobs]
 
     monkeypatch.setattr(control, "computed", rows)
     assert set(verdicts(control.comparison_sections(effort)[0]).values()) == {verdict}

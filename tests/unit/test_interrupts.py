@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import signal
 import subprocess
 import sys
@@ -84,9 +85,17 @@ def test_ctrl_c_while_an_executable_loads_leaves_no_traceback(ros_domain, words)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_c_code_calls_python_is_kept_without_a_traceback(monkeypatch, capfd, number):
-    """As while numba loads what is compiled."""
+def test_a_signal_at_the_start_is_kept_without_a_traceback(monkeypatch, capfd, number):
+    """While C code calls Python, as numba does to load what is compiled, and in the middle of making an object that frees what it has."""
     from perch_core.ros.node import StopSignal
+
+    class Handle:
+        def __init__(self):
+            signal.raise_signal(number)
+            self.pointer = 0
+
+        def __del__(self):
+            self.pointer += 1
 
     monkeypatch.setattr(sys, "unraisablehook", sys.__unraisablehook__)
     former = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
@@ -95,8 +104,13 @@ def test_a_signal_while_c_code_calls_python_is_kept_without_a_traceback(monkeypa
         ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
         assert stop
         with pytest.raises(SystemExit):
-            signal.raise_signal(number)
+            Handle()
+        gc.collect()
+        assert capfd.readouterr().err == ""
+        stop.patient = True
+        Handle.__new__(Handle)  # from now on an error is one
+        gc.collect()
+        assert "pointer" in capfd.readouterr().err
     finally:
         for each, handler in former.items():
             signal.signal(each, handler)
-    assert capfd.readouterr().err == ""

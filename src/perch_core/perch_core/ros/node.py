@@ -101,13 +101,14 @@ class StopSignal:
     """Becomes true with SIGINT or SIGTERM.
 
     rclpy's own handlers end a wait by an exception out of whatever callback runs, which EventsExecutor cannot pass on;
-    a flag lets the callback finish. Until `patient` is set there is no callback of ROS: then it ends the process at once. Where
-    C code has called Python (numba loads its cache so) it would be printed and lost: it is not printed, and the flag ends the process.
+    a flag lets the callback finish. Until `patient` is set there is no callback of ROS: then it ends the process at once, by SystemExit.
+    What Python would print of that is not printed: where C code has called Python (numba loads its cache so) SystemExit is lost, and the flag
+    ends the process; objects that were being made fail as they are deleted.
     """
 
     def __init__(self) -> None:
         self._set = self.patient = False
-        others, sys.unraisablehook = sys.unraisablehook, lambda lost: None if lost.exc_type is SystemExit else others(lost)
+        others, sys.unraisablehook = sys.unraisablehook, lambda lost: None if self and not self.patient else others(lost)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._handle)
 
