@@ -54,17 +54,17 @@ class _Flown:
 def _fly(task: tuple[str, int]) -> _Flown:
     """One rendered perch through VIO and UKF."""
     cv2.setNumThreads(1)
-    flight = estimation_flight.fly(load_scenario(task[0]), task[1])
+    scenario = load_scenario(task[0])
+    flight, begin = estimation_flight.fly(scenario, task[1]), estimation_flight.motion_of(scenario, task[1]).perch_time
     steps = estimation_flight.run_vio(flight)
     late = estimation_flight.run_estimator(flight, steps, latency=LATENCY)
     prompt = estimation_flight.run_estimator(flight, steps, latency=0.0)
-    return _Flown([1e3 * s.cost for s in steps], 100 * _rmse(flight, late), float(np.degrees(np.linalg.norm(late.errors[-1, 6:9]))),
-                  float(_rmse(flight, late).mean() / _rmse(flight, prompt).mean()))
+    return _Flown([1e3 * s.cost for s in steps], 100 * _rmse(late, begin), float(np.degrees(np.linalg.norm(late.errors[-1, 6:9]))),
+                  float(_rmse(late, begin).mean() / _rmse(prompt, begin).mean()))
 
 
-def _rmse(flight: estimation_flight.Flight, track: estimation_flight.EstimatorTrack) -> np.ndarray:
-    perching = track.times >= flight.motion.perch_time
-    return np.sqrt((track.errors[perching, :3] ** 2).mean(axis=0))
+def _rmse(track: estimation_flight.EstimatorTrack, begin: float) -> np.ndarray:
+    return np.sqrt((track.errors[track.times >= begin, :3] ** 2).mean(axis=0))
 
 
 def _ukf(quick: bool) -> list[Figure]:

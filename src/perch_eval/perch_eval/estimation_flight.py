@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -32,7 +33,7 @@ from perch_perception.vio_component import VioComponent, VioComponentConfig
 from perch_sim.calibration import true_imu, true_mount
 from perch_sim.lockstep import Task
 from perch_sim.lockstep.batches import Arrival
-from perch_sim.rendering import Renderer, build_scene
+from perch_sim.rendering import Renderer, Scene, build_scene
 from perch_sim.scenario import Scenario
 
 STRIDE = 5        # samples between states of the estimator that are kept
@@ -40,9 +41,20 @@ TRANSPORT = 0.02  # from the middle of an exposure to the arrival of its image [
 DURATIONS = {1.7: 1.8, 3.0: 2.0}  # of the perch by distance: 570-700 deg/s at 90 deg [m -> s]
 
 
+class TrueMotion(Protocol):
+    """A motion whose state is known at any time in [0, duration] [s]."""
+
+    @property
+    def duration(self) -> float:
+        """Of all of it [s]."""
+
+    def sample(self, times: np.ndarray) -> Motion:
+        """The state at times [s], shape (n,)."""
+
+
 @dataclass(frozen=True)
 class Flight:
-    """A perch as the sensors saw it.
+    """A motion as the sensors saw it.
 
     Attributes:
         motion: the true motion, at any time.
@@ -54,7 +66,7 @@ class Flight:
         vehicle: name of its file.
     """
 
-    motion: PerchMotion
+    motion: TrueMotion
     truth: Motion
     readings: ImuReadings
     mount: CameraMount
@@ -86,12 +98,16 @@ def fly(scenario: Scenario, seed: int) -> Flight:
         scenario: room, pad and realism; its target must lie straight ahead of the start.
         seed: of everything.
     """
+    return seen(motion_of(scenario, seed), build_scene(scenario, seed), scenario, seed)
+
+
+def seen(motion: TrueMotion, scene: Scene, scenario: Scenario, seed: int) -> Flight:
+    """Sensor data of a motion in a scene, as `fly`; of the scenario vehicle and realism count."""
     vehicle = load_vehicle(scenario.vehicle)
     mount, rng = vehicle.mounts["down"], np.random.default_rng([seed, 7])
     real = mount if scenario.realism == "ideal" else true_mount(mount, rng)
-    motion = motion_of(scenario, seed)
     truth = motion.sample(np.arange(0.0, motion.duration - 1.5 * CONTROL_PERIOD, CONTROL_PERIOD))
-    renderer = Renderer(build_scene(scenario, seed), real, seed)
+    renderer = Renderer(scene, real, seed)
     frames = []
     for middle in np.arange(0.02 + rng.uniform(0, 1 / mount.rate), motion.duration - 0.02, 1 / mount.rate):
         poses = motion.sample(middle + np.linspace(-0.5, 0.5, 5) * renderer.exposure.time)

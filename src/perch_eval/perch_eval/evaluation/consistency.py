@@ -77,15 +77,15 @@ def _fly(seed: int) -> _Run:
     """One flight."""
     cv2.setNumThreads(1)
     scenario = load_scenario(SCENARIO)
-    flight = flights.fly(scenario, seed)
+    motion, flight = flights.motion_of(scenario, seed), flights.fly(scenario, seed)
     steps = flights.run_vio(flight)
-    track = flights.run_estimator(flight, steps, begin=flight.motion.settings.ground + AIRBORNE_AFTER)
+    track = flights.run_estimator(flight, steps, begin=motion.settings.ground + AIRBORNE_AFTER)
     posed = [s for s in steps if s.error is not None]
     seen = [s for s in posed if s.result.nis_dimension]
     nees = [consistency.nees(s.error[:6], s.result.estimate.pose_covariance) for s in posed if s.error is not None and s.result.estimate is not None]
     return _Run(track, np.array([s.time for s in posed]), np.array(nees),
                 sum(s.result.nis for s in seen) / sum(s.result.nis_dimension for s in seen),
-                see_target(scenario, flight, track, seed, flight.motion.perch_time + LOOK[0], flight.motion.perch_time + LOOK[1]))
+                see_target(scenario, flight, track, seed, motion.perch_time + LOOK[0], motion.perch_time + LOOK[1]))
 
 
 def _judged(groups: dict[str, slice], times: np.ndarray, errors: list[np.ndarray], covariances: list[np.ndarray]) -> list[Consistency]:

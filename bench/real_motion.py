@@ -1,0 +1,83 @@
+"""VIO on images rendered along flights that racing pilots have flown; part of `python3 bench/recordings.py`.
+
+The motion is that of UZH-FPV's ground truth, the camera, its calibration errors and the IMU are the simulator's. The floor is a metre
+below the place where the drone stood: a pilot's take-off shows a camera 4 cm above the floor nothing that it can follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from perch_core.vehicle import GRAVITY
+from perch_eval import estimation_flight
+from perch_eval.campaign.progress import counted
+from perch_eval.campaign.workers import in_processes
+from perch_eval.perch_motion import Motion
+from perch_perception.vio import FrameOutcome
+from perch_sim.rendering import build_scene
+from perch_sim.scenario import load_scenario
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+FLIGHTS = {"indoor_forward_5": 15.0, "indoor_forward_9": 13.0, "indoor_forward_10": 13.0}  # the first seconds of each
+SEEDS = range(1, 6)
+ABOVE = 1.0      # the floor, at the start [m]
+KNOTS = 5        # of the truth's samples, which come with 500 Hz, one is a knot
+BESIDE = 3.0     # from the path to the walls [m]
+
+
+class RealMotion:
+    """A recorded motion from its start on, which lies `ABOVE` the origin, level and heading along x.
+
+    Attributes:
+        duration: of what is flown of it [s].
+        low, high: corners of the box around it [m], shape (3,).
+    """
+
+    def __init__(self, file: Path, duration: float) -> None:
+        self.duration = duration
+        rows = np.loadtxt(file)[::KNOTS]
+        rows = rows[rows[:, 0] <= rows[0, 0] + duration + 1.0]
+        times, turned = rows[:, 0] - rows[0, 0], Rotation.from_quat(rows[:, 4:])
+        level = Rotation.from_euler("z", -turned[0].as_euler("ZYX")[0])
+        points = level.apply(rows[:, 1:4] - rows[0, 1:4]) + (0.0, 0.0, ABOVE)
+        self._path = make_interp_spline(times, points, k=5)
+        self._turn = RotationSpline(times, level * turned * (level * turned[0]).inv())
+        self.low, self.high = points.min(axis=0), points.max(axis=0)
+
+    def sample(self, times: np.ndarray) -> Motion:
+        """The state at times [s], shape (n,)."""
+        R, a = self._turn(times).as_matrix(), self._path(times, 2)
+        return Motion(times, self._path(times), self._path(times, 1), R, self._turn(times, 1), np.einsum("nji,nj->ni", R, a + (0.0, 0.0, GRAVITY)))
+
+
+def flown(folder: Path) -> dict[str, Any]:
+    """All flights with all seeds: final errors as shares of the path, mean NEES of the position over 3, frames that were lost."""
+    jobs = [(folder / f"{name}_snapdragon_with_gt.txt", duration, seed) for (name, duration), seed in product(FLIGHTS.items(), SEEDS)]
+    found = dict(counted(in_processes(fly, jobs), len(jobs), what="flights"))
+    rows = [[found[job] for job in jobs if job[0].name.startswith(f"{name}_")] for name in FLIGHTS]
+    return {"flights": [{"flight": name, "path_m": own[0]["path_m"], "error_percent": [100.0 * one["error_m"] / one["path_m"] for one in own],
+                         "nees": float(np.mean([one["nees"] for one in own])), "lost": sum(one["lost"] for one in own)}
+                        for name, own in zip(FLIGHTS, rows)]}
+
+
+def fly(job: tuple[Path, float, int]) -> dict[str, float]:
+    """One flight with a seed's textures, calibration errors and noise; place and heading of the start are known to 1 mm and 1 mrad."""
+    cv2.setNumThreads(1)
+    file, duration, seed = job
+    motion, scenario = RealMotion(file, duration), load_scenario("surface_90")
+    size = motion.high - motion.low + 2.0 * BESIDE
+    world = replace(scenario.world, room=(float(size[0]), float(size[1]), float(motion.high[2]) + BESIDE),
+                    room_centre=tuple((0.5 * (motion.low + motion.high))[:2].tolist()))
+    scene = replace(build_scene(replace(scenario, world=world), seed), target=None, board=None)
+    flight = estimation_flight.seen(motion, scene, scenario, seed)
+    steps = estimation_flight.run_vio(flight)
+    posed = [(s.error[:3], s.result.estimate.pose_covariance[:3, :3]) for s in steps if s.error is not None and s.result.estimate is not None]
+    return {"path_m": float(np.linalg.norm(np.diff(flight.truth.p_WB, axis=0), axis=1).sum()), "error_m": float(np.linalg.norm(posed[-1][0])),
+            "nees": float(np.mean([e @ np.linalg.solve(P, e) for e, P in posed])) / 3.0,
+            "lost": sum(s.result.outcome is FrameOutcome.LOST for s in steps)}
