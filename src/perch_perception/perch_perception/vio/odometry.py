@@ -219,10 +219,13 @@ class VisualInertialOdometry:
         return replace(self._known, R_WB=self._known.R_WB @ dR @ so3.exp(J @ (gyro_bias - self._turned_bias)))
 
     def _begin(self, state: at.State) -> None:
-        if self._lost is not None:  # it has moved since by nobody knows what
+        if self._lost is not None:
             since, speed = self._lost
-            reach = 1e-9 * (state.stamp - since) * max(speed, float(np.linalg.norm(state.v_WB)))
-            state.P[at.POSITION, at.POSITION] += reach**2 * np.eye(3)
+            if since >= self._imu.oldest:
+                start.carry(state, preintegrate(self._imu.run(since, state.stamp), state.gyro_bias, state.accel_bias))
+            else:  # it has moved since by nobody knows what
+                reach = 1e-9 * (state.stamp - since) * max(speed, float(np.linalg.norm(state.v_WB)))
+                state.P[at.POSITION, at.POSITION] += reach**2 * np.eye(3)
             self._lost = None
         self.filter = Msckf(self.config, state, self.mount.camera.fx)
         self._informed = state.stamp

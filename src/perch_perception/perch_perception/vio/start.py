@@ -14,6 +14,7 @@ from perch_perception.ukf.unscented import ACCEL, DT, GYRO
 from perch_perception.vio import ekf
 from perch_perception.vio import state as at
 from perch_perception.vio.config import VioConfig
+from perch_perception.vio.preintegration import Preintegration
 from perch_perception.vio.state import State
 
 
@@ -91,3 +92,20 @@ def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray
     dx, state.P, _ = ekf.update(state.P, np.arange(at.INERTIAL_SIZE), H, accel - up_B, imu.accel_noise_density**2 * shaken / T)
     state.inject(dx)
     return state
+
+
+def carry(state: State, since: Preintegration) -> None:
+    """Move the position of a start on from where it was known, by the IMU since and the velocity and attitude of the start.
+
+    With p' = p + v T + g T^2/2 + R dp, v' = v + g T + R dv and R = R' dR^T of the start (R', v', p'):
+    p' - p = v' T - g T^2/2 - R' u,  u = dR^T (T dv - dp).
+    """
+    T, R = since.duration, state.R_WB
+    u = since.dR.T @ (T * since.dv - since.dp)
+    state.p_WB += T * state.v_WB + (0.0, 0.0, 0.5 * GRAVITY * T**2) - R @ u
+    F = np.eye(len(state.P))
+    F[at.POSITION, at.VELOCITY], F[at.POSITION, at.THETA] = T * np.eye(3), R @ so3.hat(u)
+    by_motion = -R @ np.hstack([so3.hat(u), -since.dR.T, T * since.dR.T])  # derivative by (log dR, dp, dv)
+    F[at.POSITION, at.GYRO_BIAS.start:at.ACCEL_BIAS.stop] = by_motion @ since.J
+    state.P = F @ state.P @ F.T
+    state.P[at.POSITION, at.POSITION] += by_motion @ since.Q @ by_motion.T
