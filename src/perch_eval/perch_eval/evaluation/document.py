@@ -25,10 +25,11 @@ def write(sections: Sequence[Section], effort: Effort, duration: float) -> None:
 
 
 def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, Any], data: str = "") -> None:
-    """A page among the results, with commit, command and machine below its heading, and its figures as JSON; `data`: another name of these."""
+    """A page among the results, with commit, command and machine below its heading, and its figures as JSON with the same; `data`: another name of these."""
     made_by = [banner(commit()), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
     (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by, *lines[1:]]) + "\n")
-    (effort.out / f"{data or name}.json").write_text(json.dumps(finite(content), indent=1) + "\n")
+    whole = {**made_of(), "command": effort.command, "machine": machine(), **content}
+    (effort.out / f"{data or name}.json").write_text(json.dumps(finite(whole), indent=1) + "\n")
 
 
 def counts(sections: Sequence[Section]) -> Counter[str]:
