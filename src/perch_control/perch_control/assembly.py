@@ -59,9 +59,7 @@ class Assembly:
 
     def restart(self) -> None:
         """A new flight, on the ground, with the law that flies now."""
-        flown = self.flown
-        self.laws[flown].begin()
-        self._begin(flown, self.flight.compensator is not None)
+        self._begin(self.flown, self.flight.compensator is not None)
 
     def _begin(self, law: str, adaptive: bool) -> None:
         self.flight = FlightController(self.vehicle, self.laws[law], self._params.gain_set, self._params.flight)

@@ -56,6 +56,7 @@ class FlightController:
         self._thrust = ThrustBelief(vehicle)
         self._senses = Senses()
         self._period = MeasuredPeriod()
+        law.begin()
 
     def use(self, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
         """Fly another law, or the same one with other gains and limits, from the next step on."""
