@@ -45,14 +45,18 @@ _HALVING = 1.0  # sigma of the smoothing in cv2.pyrDown [px]
 # the size, smoothed with sigma = 1.5 px before: measured on 640 x 480 images of 5 grey levels of noise
 _NOISE_CORNER = 2.3e-6
 _KLT_EIGENVALUE = 1024.0  # least eigenvalue of the mean of g g^T over a patch, in what OpenCV's KLT gives for it
+# unit white noise in OpenCV's gradients, [-1 0 1]/2 along an axis and [3 10 3]/16 across it: variance, and how much of it the least
+# eigenvalue scatters from patch to patch (measured in images of noise alone)
+_NOISE_GRADIENT, _NOISE_SCATTER = (0.5**2 + 0.5**2) * (3**2 + 10**2 + 3**2) / 16**2, 0.08
 _FLAT_STEP, _MID_GREY = 8, 128.0  # the average is taken in an image of 1 / step the size
 
 
 def _noise(image: np.ndarray) -> float:
-    """1 sigma of an image's white noise [grey levels], from second differences along some rows."""
-    rows = image[::16].astype(np.int16)
-    second = 2 * rows[:, 1:-1] - rows[:, :-2] - rows[:, 2:]
-    return float(np.median(np.abs(second))) / (0.6745 * np.sqrt(6.0))
+    """1 sigma of an image's white noise [grey levels], from second differences along and across some rows (Immerkaer 1996)."""
+    above, row, below = (image[k : image.shape[0] - 2 + k : 16].astype(np.int16) for k in range(3))
+    across = above - 2 * row + below
+    second = across[:, :-2] - 2 * across[:, 1:-1] + across[:, 2:]
+    return float(np.median(np.abs(second))) / (0.6745 * 6.0)
 
 
 def flattened(image: np.ndarray) -> np.ndarray:
@@ -206,7 +210,8 @@ class Tracker:
         """1 sigma of the least squares fit of each feature's patch, along the axis in which it is known worst [px], shape (n,).
 
         sigma^2 = sigma_n^2 / lambda_min(sum g g^T), with sigma_n the image's noise [grey levels] and g the gradients over the
-        patch [grey levels/px] (Foerstner and Guelch 1987). Where noise is all that is in the image its own gradients bound it.
+        patch [grey levels/px] (Foerstner and Guelch 1987), less what the noise itself adds to g g^T. Where noise is all that is
+        in the image the scatter of that bounds sigma.
         """
         if not len(self._pixels):
             return np.zeros(0)
@@ -214,8 +219,10 @@ class Tracker:
         _, _, least = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
             image, image, self._pixels.reshape(-1, 1, 2), None, winSize=(_WINDOW,) * 2, maxLevel=0,
             flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
-        information = _KLT_EIGENVALUE * _WINDOW**2 * least.ravel().astype(float)
-        return _noise(image) / np.sqrt(np.maximum(information, np.finfo(np.float32).tiny))
+        noise = _noise(image)
+        of_noise = max(_NOISE_GRADIENT * noise**2, float(np.finfo(np.float32).tiny))
+        of_scene = _KLT_EIGENVALUE * least.ravel().astype(float) - of_noise
+        return noise / np.sqrt(_WINDOW**2 * np.maximum(of_scene, _NOISE_SCATTER * of_noise))
 
     def _refill(self, image: np.ndarray) -> int:
         """Detect corners away from the features there are; those that noise alone would make are not taken.
