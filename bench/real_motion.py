@@ -76,7 +76,7 @@ def fly(job: tuple[Path, float, int]) -> dict[str, float]:
                     room_centre=tuple((0.5 * (motion.low + motion.high))[:2].tolist()))
     scene = replace(build_scene(replace(scenario, world=world), seed), target=None, board=None)
     flight = estimation_flight.seen(motion, scene, scenario, seed)
-    steps = estimation_flight.run_vio(flight)
+    steps = estimation_flight.run_vio(flight, level_ground=False)
     posed = [(s.error[:3], s.result.estimate.pose_covariance[:3, :3]) for s in steps if s.error is not None and s.result.estimate is not None]
     return {"path_m": float(np.linalg.norm(np.diff(flight.truth.p_WB, axis=0), axis=1).sum()), "error_m": float(np.linalg.norm(posed[-1][0])),
             "nees": float(np.mean([e @ np.linalg.solve(P, e) for e, P in posed])) / 3.0,

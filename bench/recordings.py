@@ -20,7 +20,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import real_motion
 import recordings_scores as scores
-from perch_core.json_values import finite
+from perch_core.json_values import finite, write_json
 from perch_core.processes import one_thread_for_sums
 from perch_eval.evaluation.document import machine, table
 from perch_eval.revision import banner, commit, digest, made_of, root
@@ -229,7 +229,7 @@ def main() -> int:
             results[key] = finite(recording.score(*places))
             print(f"{key}: {json.dumps(results[key])}", flush=True)
     made_by = "python3 bench/recordings.py FOLDER"
-    data.write_text(json.dumps({**made_of(), "command": made_by, "machine": machine(), "recordings": results}, indent=1) + "\n")
+    write_json(data, {**made_of(), "command": made_by, "machine": machine(), "recordings": results})
     (arguments.out / "README.md").write_text("\n".join(page(results, made_by)) + "\n")
     return 0
 

@@ -20,6 +20,7 @@ exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or fil
 
 
 def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
+    from perch_core.json_values import write_json
     from perch_planner import plan_output
     from perch_planner.planner import plan
     from perch_planner.problem import Limits
@@ -31,7 +32,7 @@ def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
     planned = plan(problem, settings, vehicle)
     out.mkdir(parents=True, exist_ok=True)
     plan_output.write_csv(out / "plan.csv", planned, vehicle.mass)
-    plan_output.write_json(out / "plan.json", planned)
+    write_json(out / "plan.json", plan_output.as_json(planned))
     plan_output.draw(out / "plan.png", planned, problem, Limits.of(settings, vehicle), vehicle)
     print(f"contact after {planned.duration:.3f} s; {planned.iterations} programs in {1e3 * planned.solve_time:.2f} ms")
     for certificate in planned.certificates:

@@ -238,11 +238,17 @@ class _Estimator(StateEstimator):
         self._samples += 1
 
 
-def run_vio(flight: Flight, begin: float = 0.0) -> list[VioStep]:
-    """VIO over a flight; it is switched on at `begin` [s], and told the pose of that moment, as wrong as the flight has it."""
+def run_vio(flight: Flight, begin: float = 0.0, level_ground: bool = True) -> list[VioStep]:
+    """VIO over a flight; it is switched on at `begin` [s], and told the pose of that moment, as wrong as the flight has it.
+
+    Args:
+        flight: the sensor data.
+        begin: where it starts [s].
+        level_ground: whether the vehicle stands on level ground at the start.
+    """
     standing = flight.motion.sample(np.array([begin])).p_WB[0] - (0.0, 0.0, load_vehicle(flight.vehicle).standing_height)
     vio = _Vio(VioComponentConfig(
-        vehicle=flight.vehicle,
+        vehicle=flight.vehicle, level_ground=level_ground,
         start_position=tuple((standing + flight.told_wrong[:3]).tolist()), start_yaw_deg=float(np.degrees(flight.told_wrong[3]))))
     vehicle = _Vehicle(flight, begin)
     _run(Loop(vehicle, {"vio": vio}, {"vio": Task(0.0)}, {}), vehicle)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from contextlib import suppress
@@ -13,7 +12,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from perch_control.modes import Command
 from perch_core.errors import PerchError
-from perch_core.json_values import finite
+from perch_core.json_values import to_text
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
 from perch_eval.camera_clip import clip
@@ -70,7 +69,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
             "reference_collisions": inspection.reference.collisions, "collisions": inspection.collisions,
             "reference_reprojection_px": inspection.reference.reprojection, "reprojection_px": inspection.flown.reprojection,
             "least_clearance": float(inspection.flown.clearance.min())}
-    files = {"report.json": json.dumps(finite(report), indent=2) + "\n", "report.html": _page(flight, scenario, report, vehicle, inspection)}
+    files = {"report.json": to_text(report), "report.html": _page(flight, scenario, report, vehicle, inspection)}
     try:
         for name, content in files.items():
             (folder / name).write_text(content)

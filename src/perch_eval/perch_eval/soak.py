@@ -24,7 +24,7 @@ from perch_eval.domain import own_domain
 from perch_eval.evaluation.document import machine, table
 from perch_eval.modelled_sight_node import blind_launches, blind_programs
 from perch_eval.nodes import FAST_NODES, node_programs, programs, sharing
-from perch_eval.revision import banner, commit
+from perch_eval.revision import banner, made_of
 from perch_eval.ros.mission_client import MissionClient
 from perch_eval.stack import Stack, StackError
 from perch_sim.scenario import load_scenario
@@ -241,7 +241,7 @@ def _soak(args: argparse.Namespace) -> int:
     if not 0.0 < args.hours <= 1000.0:
         raise PerchError(f"--hours {args.hours}: is outside (0, 1000]")
     output_folder(args.out), output_folder(args.logs, "--logs")
-    write = partial(_write, args, commit(), began)
+    write = partial(_write, args, made_of(), began)
     composed = sharing(args.composed, otherwise=FAST_NODES)
     flights = fly(args.scenario, args.seed, args.cameras, composed, args.hours, args.flights, args.logs, write)
     if not flights:
@@ -251,12 +251,12 @@ def _soak(args: argparse.Namespace) -> int:
     return 1 if problems else 0
 
 
-def _write(args: argparse.Namespace, code: str, began: float, flights: Sequence[Flight]) -> list[str]:
+def _write(args: argparse.Namespace, code: Mapping[str, str], began: float, flights: Sequence[Flight]) -> list[str]:
     """Write figures and page of what has been flown; returns what is not as it should be."""
     name, problems = args.name or Path(args.scenario).stem, verdicts(flights)
     plot(flights, args.out / f"{name}.png")
     (args.out / f"{name}.json").write_text(json.dumps({
-        "scenario": args.scenario, "seed": args.seed, "cameras": args.cameras, "commit": code, "machine": machine(),
+        **code, "scenario": args.scenario, "seed": args.seed, "cameras": args.cameras, "machine": machine(),
         "wall_s": round(time.monotonic() - began, 1), "problems": problems, "growth": growth(flights),
         "flights": [asdict(flight) for flight in flights]}, separators=(",", ":")) + "\n")
     (args.out / "README.md").write_text(page(args.out))

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from perch_core.flatness import FlatState, flat_to_state
-from perch_core.json_values import finite
 from perch_core.vehicle import Vehicle
 from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP
 from perch_planner.planner import PerchPlan
@@ -52,14 +50,9 @@ def as_json(plan: PerchPlan) -> dict[str, Any]:
         "duration": plan.duration, "iterations": plan.iterations, "solve_time": plan.solve_time,
         "segments": [{"duration": float(d), **{k: row.tolist() for k, row in zip(("x", "y", "z", "yaw"), c)}}
                      for d, c in zip(plan.trajectory.durations, plan.trajectory.coefficients)],
-        "certificates": [{"quantity": c.quantity, "unit": c.unit, **{f: finite(getattr(c, f)) for f in fields},
+        "certificates": [{"quantity": c.quantity, "unit": c.unit, **{f: getattr(c, f) for f in fields},
                           "method": c.method, "holds": c.holds} for c in plan.certificates],
     }
-
-
-def write_json(path: Path, plan: PerchPlan) -> None:
-    """Write `as_json`."""
-    path.write_text(json.dumps(as_json(plan), indent=1) + "\n")
 
 
 def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Requirements:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from perch_core.json_values import finite
+from perch_core.json_values import write_json
 from perch_eval.evaluation.sections import BETTER, FAILS, HOLDS, MISSING, VACUOUS, WORSE, Effort, Section
 from perch_eval.revision import banner, commit, made_of
 
@@ -28,8 +27,7 @@ def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, A
     """A page among the results, with commit, command and machine below its heading, and its figures as JSON with the same; `data`: another name of these."""
     made_by = [banner(commit()), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
     (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by, *lines[1:]]) + "\n")
-    whole = {**made_of(), "command": effort.command, "machine": machine(), **content}
-    (effort.out / f"{data or name}.json").write_text(json.dumps(finite(whole), indent=1) + "\n")
+    write_json(effort.out / f"{data or name}.json", {**made_of(), "command": effort.command, "machine": machine(), **content})
 
 
 def counts(sections: Sequence[Section]) -> Counter[str]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.errors import ConfigError, PerchError
+from perch_core.json_values import write_json
 from perch_core.processes import one_thread_for_sums
 from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
@@ -26,7 +27,7 @@ from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.perception import Perception
 from perch_eval.recordings.pictures_seen import drawn, guessed_mount, look
 from perch_eval.recordings.recording import Recording, RecordingError
-from perch_eval.recordings.report import Told, bias_figure, error_figure, frames_figure, path_figure, write_json
+from perch_eval.recordings.report import Told, bias_figure, error_figure, frames_figure, path_figure
 from perch_eval.recordings.trajectory import Trajectory, read_truth, write_tum
 from perch_perception.images import ImageError
 from perch_perception.line_mapping import LineDetectionConfig

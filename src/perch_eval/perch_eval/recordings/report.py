@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from perch_core.json_values import finite
+from perch_core.json_values import write_json
 from perch_eval.page import image, images, page, section, table
 from perch_eval.recordings.findings import Finding
 from perch_eval.recordings.evaluation import Evaluation
@@ -48,11 +47,6 @@ class Told:
             if finding.level != "ok":
                 print(f"{finding.level}: {finding.about}: {finding.text}")
         print(f"report: {folder / 'report.html'}")
-
-
-def write_json(file: Path, content: Any) -> None:
-    """Without nan and infinities, which are null."""
-    file.write_text(json.dumps(finite(content), indent=1) + "\n")
 
 
 def path_figure(estimate: Trajectory, evaluation: Evaluation | None) -> Figure:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from perch_core import config
 from perch_core.errors import PlanningRefusal
-from perch_core.json_values import finite
+from perch_core.json_values import write_json
 from perch_core.rotor_model import THRUST
 from perch_planner.powerline.plan import Manoeuvre
 from perch_planner.powerline.problem import PlannedProblem
@@ -40,7 +39,7 @@ def summary(planned: PlannedProblem) -> dict[str, Any]:
                            "iterations": part.iterations, "solver": part.solver, "intervals": part.intervals, "cost": part.cost,
                            "peak_rotor_thrust_N": float(part.states[:, THRUST].max()), "least_height_m": float(part.states[:, 2].min())}
     certificates = [{"quantity": b.quantity, "unit": b.unit, "minimum": b.minimum, "maximum": b.maximum,
-                     "lower_limit": finite(b.lower_limit), "upper_limit": finite(b.upper_limit), "margin": b.margin,
+                     "lower_limit": b.lower_limit, "upper_limit": b.upper_limit, "margin": b.margin,
                      "holds": b.holds} for b in planned.plan.bounds]
     out = {"problem": planned.problem.name, "vehicle": planned.vehicle.name, "compiled": planned.planner.solver.compiled,
            **parts, "without_recovery": planned.plan.without_recovery, "certificates": certificates}
@@ -86,5 +85,5 @@ def write_report(planned: PlannedProblem, folder: Path, animation: bool = False)
         paths.append(folder / "plan.gif")
         picture.draw_animation(planned, paths[-1])
     out = summary(planned)
-    paths[1].write_text(json.dumps(out, indent=2) + "\n", encoding="utf-8")
+    write_json(paths[1], out)
     return {**out, "files": [str(path) for path in paths]}
