@@ -1,7 +1,8 @@
 """VIO on images rendered along flights that racing pilots have flown; part of `python3 bench/recordings.py`.
 
-The motion is that of UZH-FPV's ground truth, the camera, its calibration errors and the IMU are the simulator's. The floor is a metre
-below the place where the drone stood: a pilot's take-off shows a camera 4 cm above the floor nothing that it can follow.
+The motion is that of UZH-FPV's ground truth, the camera, its calibration errors and the IMU are the simulator's. Before the take-off
+the truth jitters by some millimetres while the drone stands: there it is replaced by its mean. The floor is a metre below that place:
+a pilot's take-off shows a camera 4 cm above the floor nothing that it can follow.
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ from scipy.spatial.transform import Rotation, RotationSpline
 FLIGHTS = {"indoor_forward_5": 15.0, "indoor_forward_9": 13.0, "indoor_forward_10": 13.0}  # the first seconds of each
 SEEDS = range(1, 6)
 ABOVE = 1.0      # the floor, at the start [m]
+TAKE_OFF = 0.7, 1.2  # between these the mean of the truth becomes the truth [s]
 KNOTS = 5        # of the truth's samples, which come with 500 Hz, one is a knot
 BESIDE = 3.0     # from the path to the walls [m]
 
 
 class RealMotion:
-    """A recorded motion from its start on, which lies `ABOVE` the origin, level and heading along x.
+    """A recorded motion from a standstill on, which lies `ABOVE` the origin, level and heading along x.
 
     Attributes:
         duration: of what is flown of it [s].
@@ -43,11 +45,16 @@ class RealMotion:
         self.duration = duration
         rows = np.loadtxt(file)[::KNOTS]
         rows = rows[rows[:, 0] <= rows[0, 0] + duration + 1.0]
-        times, turned = rows[:, 0] - rows[0, 0], Rotation.from_quat(rows[:, 4:])
-        level = Rotation.from_euler("z", -turned[0].as_euler("ZYX")[0])
-        points = level.apply(rows[:, 1:4] - rows[0, 1:4]) + (0.0, 0.0, ABOVE)
+        times, turned, points = rows[:, 0] - rows[0, 0], Rotation.from_quat(rows[:, 4:]), rows[:, 1:4]
+        before = times < TAKE_OFF[0]
+        stood, place = turned[before].mean(), points[before].mean(axis=0)
+        x = np.clip((times - TAKE_OFF[0]) / (TAKE_OFF[1] - TAKE_OFF[0]), 0.0, 1.0)
+        share = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+        heading = Rotation.from_euler("z", -stood.as_euler("ZYX")[0])
+        points = heading.apply(share[:, None] * (points - place)) + (0.0, 0.0, ABOVE)
+        turned = stood * Rotation.from_rotvec(share[:, None] * (stood.inv() * turned).as_rotvec())
         self._path = make_interp_spline(times, points, k=5)
-        self._turn = RotationSpline(times, level * turned * (level * turned[0]).inv())
+        self._turn = RotationSpline(times, heading * turned * (heading * stood).inv())
         self.low, self.high = points.min(axis=0), points.max(axis=0)
 
     def sample(self, times: np.ndarray) -> Motion:
