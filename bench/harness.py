@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from perch_core.processes import without_collector
+from perch_eval.revision import made_of
 
 _STATISTICS = {"median": lambda x: float(np.median(x)), "p99": lambda x: float(np.percentile(x, 99)),
                "max": lambda x: float(np.max(x)), "min": lambda x: float(np.min(x))}
@@ -101,7 +102,7 @@ def machine() -> dict[str, object]:
 
 def as_json(group_figures: dict[str, list[Figure]]) -> dict[str, object]:
     """The one form in which every figure is written."""
-    return {"machine": machine(),
+    return {**made_of(), "machine": machine(),
             "figures": [{"group": group, **asdict(item)} for group, items in group_figures.items() for item in items]}
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import sys
 from pathlib import Path
 
@@ -40,6 +39,7 @@ def main() -> int:
     sys.path.insert(0, str(ROOT / "bench"))
     sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "oracles")]  # the closed loop and the oracles of the tests
     import harness
+    from perch_core.json_values import write_json
 
     results, failed = {}, False
     for group in [arguments.group] if arguments.group else GROUPS:
@@ -53,7 +53,7 @@ def main() -> int:
         print(harness.table(results[group]), flush=True)
         failed |= any(item.holds is False for item in results[group])
     if arguments.json:
-        arguments.json.write_text(json.dumps(harness.as_json(results), indent=1) + "\n")
+        write_json(arguments.json, harness.as_json(results))
     return 1 if failed else 0
 
 

@@ -40,7 +40,7 @@ def test_measure_counts_only_after_the_warm_up():
 def test_json_and_table_name_every_figure():
     items = [harness.figure("plan", "ms", [0.3], bar=0.5), harness.figure("import", "s", [1.0])]
     written = harness.as_json({"planner": items})
-    assert written["machine"]["cores"] >= 1
+    assert written["machine"]["cores"] >= 1 and {"commit", "digest"} <= set(written)
     assert [f["name"] for f in written["figures"]] == ["plan", "import"]
     assert {"name", "unit", "median", "p99", "n", "bar", "holds"} <= set(written["figures"][0])
     assert "holds" in harness.table(items) and "import" in harness.table(items)

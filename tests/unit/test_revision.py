@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -20,6 +21,12 @@ def test_a_page_says_of_which_code_it_is_and_how_it_was_made(page):
     assert re.match(r"# .+\n\n> \*\*Of commits? [0-9a-f]{7}", text)
     for what, pattern in {"command": r"`(python3 )?scripts/\w+\.py", "machine": r"\d+ cores, Python 3", "seeds": r"\b[Ss]eed|without noise|random"}.items():
         assert re.search(pattern, text), what
+
+
+@pytest.mark.parametrize("data", sorted(RESULTS.rglob("*.json")), ids=lambda data: str(data.relative_to(RESULTS)))
+def test_figures_say_of_which_code_they_are(data):
+    figures = json.loads(data.read_text())
+    assert re.fullmatch(r"[0-9a-f]{7}\+?", figures["commit"]) and re.fullmatch(r"[0-9a-f]{12}", figures["digest"])
 
 
 @pytest.mark.skipif(not NOW, reason="not in a git repository")
