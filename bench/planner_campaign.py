@@ -11,7 +11,6 @@ Takes about 0.1 s per problem; it can be stopped at any time (Ctrl-C, kill) and 
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 import sys
 import time
@@ -23,6 +22,7 @@ import numpy as np
 from random_perches import random_problem, shipped_settings
 
 from perch_core import config
+from perch_core.json_values import to_text, write_json
 from perch_core.vehicle import load_vehicle
 from perch_eval.revision import made_of
 from perch_planner.planner import plan
@@ -85,10 +85,10 @@ def main() -> int:
               "findings_of_the_verifier": broken, "unconfirmed_refusals": unconfirmed, "exceptions": exceptions,
               "plan_ms": {"median": float(np.median(ms)), "p90": float(np.percentile(ms, 90)), "max": float(ms.max())},
               "duration_s_median": float(np.median(durations or [np.nan])), "wall_clock_s": round(time.time() - begin, 1)}
-    print(json.dumps(result, indent=1))
+    print(to_text(result), end="")
     if arguments.out:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
+        write_json(arguments.out, result)
     return 1 if broken or unconfirmed or exceptions else 0
 
 
