@@ -13,7 +13,9 @@ from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
 
-TAKEN = 0.5  # a controller that still hovers so long after a plan's start has not taken it [s]
+TAKEN = 0.5       # a controller that still hovers so long after a plan's start has not taken it [s]
+TELL_AGAIN = 0.1  # between two messages to a controller that flies on although the vehicle is attached [s]
+_FLYING_ON = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerState.RECOVERING)
 
 
 class InFlight(Protocol):
@@ -36,6 +38,7 @@ class PerchingMission(MissionMachine, Generic[R]):
     _running: R          # from the first trajectory on
     _first_id: int       # of an attempt's first trajectory; ids grow
     _first_start: float  # when that starts [s]
+    _told_at: float      # that the vehicle is attached [s]
     _off = False         # the vehicle came off after the motors had stopped
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
@@ -141,6 +144,9 @@ class PerchingMission(MissionMachine, Generic[R]):
         elif self._elapsed(inputs) > self.settings.rest_time:
             result, words = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
             self._end(outputs, result, f"{words}perched", contact_time=self._contact_time)
+        elif inputs.controller in _FLYING_ON and inputs.time - self._told_at > TELL_AGAIN:
+            self._told_at = inputs.time
+            outputs.commands.append((Command.ATTACHED, "told again"))  # the first message was lost
 
     def _motors_on(self, outputs: Outputs) -> None:
         """Nothing carries the vehicle any more."""
@@ -155,6 +161,7 @@ class PerchingMission(MissionMachine, Generic[R]):
         super()._enter(phase, time, message)
         self._off = self._off and phase is Phase.RECOVERING
         if phase is Phase.PERCHED:  # however the goal ends, this is what carries the vehicle
+            self._told_at = time
             self._moves.wire = self._running.target if self._running.target.lines else None
 
     # -- plans in flight ---------------------------------------------------------------------------------------------
