@@ -350,6 +350,16 @@ def test_no_new_plan_undoes_an_abort_while_one_waits_for_its_start(state):
 
 
 @pytest.mark.parametrize("replan", [False, True])
+def test_no_new_plan_undoes_an_abort_before_the_first_plan_begins(replan):
+    world = reached(Phase.TRACKING, attempts=2, replan=replan)
+    assert world.due is not None
+    world.controller, world.due, flown = ControllerState.HOVERING, None, len(world.flown)  # it drops the plan and stays
+    while world.outcome is None:
+        world.tick()
+    assert world.outcome.result is Result.REFUSED and len(world.flown) == flown
+
+
+@pytest.mark.parametrize("replan", [False, True])
 def test_a_plan_that_the_controller_does_not_take_ends_the_goal(replan):
     world = World(takes=False)
     world.run(Goal(takeoff_height=1.2, search_timeout=6.0, attempts=2, replan=replan))

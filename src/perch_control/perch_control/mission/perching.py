@@ -111,7 +111,8 @@ class PerchingMission(MissionMachine, Generic[R]):
             outputs.commands.append((Command.HOVER, "the plan was not taken"))  # nor later
             self._end(outputs, Result.REFUSED, f"the controller has not taken the plan: {inputs.controller_message}")
             return
-        self.better(inputs, outputs)
+        if not hovers:  # a controller that hovers has not begun, or was told to stay
+            self.better(inputs, outputs)
         if inputs.time > end - self.settings.contact_early:
             self._adhesion.reset()
             self._enter(Phase.VERIFYING, inputs.time, "waiting for contact")
