@@ -29,7 +29,7 @@ class World:
         self.sees, self.plans, self.sticks, self.stays, self.recovers, self.ready = sees, plans, sticks, stays, recovers, ready
         self.machine = SurfaceMission(MissionSettings())
         self.takes, self.due = takes, None  # whether the controller takes perches; start and id of the one that waits
-        self.deaf = 0  # so many commands to arm are lost
+        self.deaf = self.lost_attached = 0  # so many commands to arm, and messages that the vehicle is attached, are lost
         self.time, self.p, self.q = 0.0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         self.controller, self.trajectory_id = ControllerState.DISARMED, 0
         self.reference = self.perch_end = self.query = None
@@ -79,6 +79,8 @@ class World:
             elif command is Command.HOVER and self.controller is not ControllerState.ATTACHED:
                 self.controller, self.hover_at, self.perch_end, self.due = ControllerState.RECOVERING, self.time + 1.0, None, None
                 self.q, self.off_at = np.array([0.0, 0.0, 0.0, 1.0]), None
+            elif command is Command.ATTACHED and self.lost_attached:
+                self.lost_attached -= 1
             elif command is Command.ATTACHED:
                 self.controller, self.off_at = ControllerState.ATTACHED, self.time
             elif command is Command.DISARM:
@@ -130,6 +132,14 @@ def test_a_perch_passes_through_every_phase():
                       Phase.PERCHED, Phase.IDLE]
     assert world.commands == [Command.ARM, Command.ATTACHED]
     assert world.outcome.contact_time == pytest.approx(world.off_at)
+
+
+def test_a_controller_that_flies_on_is_told_again_that_the_vehicle_is_attached():
+    world = World()
+    world.lost_attached = 2
+    world.run()
+    assert world.outcome.result is Result.PERCHED
+    assert world.commands == [Command.ARM] + 3 * [Command.ATTACHED]
 
 
 def test_a_command_to_arm_that_is_lost_is_given_again():
@@ -337,6 +347,16 @@ def test_no_new_plan_undoes_an_abort_while_one_waits_for_its_start(state):
         world.tick()
     assert world.outcome.result is Result.MISSED and "given up: says so" in world.outcome.message
     assert (len(world.flown), world.queries) == (flown, queries)
+
+
+@pytest.mark.parametrize("replan", [False, True])
+def test_no_new_plan_undoes_an_abort_before_the_first_plan_begins(replan):
+    world = reached(Phase.TRACKING, attempts=2, replan=replan)
+    assert world.due is not None
+    world.controller, world.due, flown = ControllerState.HOVERING, None, len(world.flown)  # it drops the plan and stays
+    while world.outcome is None:
+        world.tick()
+    assert world.outcome.result is Result.REFUSED and len(world.flown) == flown
 
 
 @pytest.mark.parametrize("replan", [False, True])

@@ -35,8 +35,8 @@ def imu_fails(loop, lasting):
 
 
 def controller_stops(loop, lasting):
-    """The controller gets and says nothing for a while."""
-    end, motors = loop.time + lasting, loop.vehicle.simulation.motors
+    """The controller gets and says nothing for a while, and finds the vehicle turned over."""
+    end, motors = upside_down(loop) + lasting, loop.vehicle.simulation.motors
     for channel in ("odometry", "imu/data_raw"):
         loop.filters["controller", channel] = lambda now, value: value if seconds(now) > end else None
     command = motors.command

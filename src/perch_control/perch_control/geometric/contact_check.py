@@ -27,7 +27,7 @@ SPAN = 1.5  # the last part of the trajectory is flown [s]
 
 
 @compiled
-def flown(start, speed, table, gains, limits, narrow, window, lead, period, vehicle):
+def flown(start, speed, table, gains, limits, narrow, window, lead, lag, period, vehicle):
     """State at the end of a flight of the geometric controller on the nominal vehicle; see `GeometricController.end_on_model`."""
     state, command = start, speed
     duration, mass, J = len(table) * period, vehicle[0][0], vehicle[0][1:4]
@@ -40,10 +40,10 @@ def flown(start, speed, table, gains, limits, narrow, window, lead, period, vehi
         reference = (r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11], r[12], r[13], r[14], r[15],
                      r[16], r[17], r[18], r[19], r[20], r[21], r[22], r[23],
                      r[24], r[25], r[26], r[27], r[28], r[29], r[30], r[31], r[32])
-        part = min(max((duration - k * period - lead) / window, 0.0), 1.0)
+        part = min(max((duration - k * period) / window, 0.0), 1.0)
         cone = narrow + part * (limits[1] - narrow)
         command = control_step(state, reference, speed, command, none, gains,
-                               (limits[0], cone, limits[2], limits[3], limits[4]), lead, vehicle)[0]
+                               (limits[0], cone, limits[2], limits[3], limits[4]), lead, lag, vehicle)[0]
         f = thrusts(approached(speed, command, middle), coefficient)
         felt = drag_compensation(state[6:10], state[3:6], vehicle[4], none)
         state = predicted(state, f, felt, period, mass, J, vehicle[2])
@@ -63,7 +63,7 @@ def miss(source: Source, controller: GeometricController) -> tuple[float, float]
     """
     T, period = source.duration, controller.period
     n = int(min(SPAN, T) / period)
-    table = packed_many(source, T - n * period + np.arange(n) * period + controller.lead)
+    table = packed_many(source, T - n * period + np.arange(n) * period + controller.lag)
     end, wanted = controller.end_on_model(*_on_reference(source.setpoint(T - n * period), controller.vehicle), table), source.setpoint(T)
     return float(np.linalg.norm(end[0:3] - wanted.p)), float(np.linalg.norm(end[3:6] - wanted.v))
 

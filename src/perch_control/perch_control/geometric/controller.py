@@ -13,7 +13,7 @@ from perch_control.geometric.contact_check import flown, miss
 from perch_control.geometric.step import control_step
 from perch_control.law import NO_COMPENSATION, ControlOutput, Law
 from perch_control.reference import Following, Source
-from perch_control.rotor_lag import RotorEstimate
+from perch_control.rotor_lag import RotorEstimate, lag_behind
 from perch_core.vehicle import ControlGains, Vehicle
 
 if TYPE_CHECKING:
@@ -63,14 +63,14 @@ class GeometricController(Law):
         return cls(vehicle, params.gain_set)
 
     @property
-    def lead(self) -> float:
-        """The reference is wanted this far ahead of the state [s]."""
-        return self.gains.lead
+    def lag(self) -> float:
+        """By which the rotors follow: the state is predicted, and the reference wanted, this far ahead [s]."""
+        return lag_behind(self.vehicle.motor_time_constant, self.gains.lead, self.period)
 
     def control(self, state: tuple[float, ...], reference: Following, rotors: RotorEstimate,
                 compensation: tuple[float, ...] = NO_COMPENSATION, time_to_contact: float = np.inf) -> ControlOutput:
         """As `step`, with the running reference."""
-        return self.step(state, reference.setpoint(self.gains.lead).packed, rotors, compensation, time_to_contact)
+        return self.step(state, reference.setpoint(self.lag).packed, rotors, compensation, time_to_contact)
 
     def step(self, state: tuple[float, ...], reference: tuple[float, ...], rotors: RotorEstimate,
              compensation: tuple[float, ...] = NO_COMPENSATION, time_to_contact: float = np.inf) -> ControlOutput:
@@ -78,7 +78,7 @@ class GeometricController(Law):
 
         Args:
             state: p_WB [m], v_WB [m/s] in W, q_WB xyzw, w_WB_B [rad/s], 13 floats.
-            reference: setpoint `lead` seconds from now, 33 floats (see `Setpoint.packed`).
+            reference: setpoint `lag` seconds from now, 33 floats (see `Setpoint.packed`).
             rotors: rotor speeds and what they are following.
             compensation: acceleration in W and angular acceleration in B that make up for disturbances, 6 floats.
             time_to_contact: [s]; near zero position feedback gives way to attitude.
@@ -86,7 +86,7 @@ class GeometricController(Law):
         share = min(max(time_to_contact / CONTACT_WINDOW, 0.0), 1.0)
         cone = self._narrow + share * (self._wide - self._narrow)
         out = control_step(state, reference, rotors.speed, rotors.command, compensation, self._gains, self._limits(cone),
-                           self.gains.lead, self._vehicle)
+                           self.gains.lead, self.lag, self._vehicle)
         return ControlOutput(*out)
 
     def _limits(self, cone: float) -> tuple[float, ...]:
@@ -109,10 +109,10 @@ class GeometricController(Law):
         Args:
             start: state at the beginning, shape (13,).
             rotors: rotors at the beginning.
-            table: setpoints `lead` ahead of each period until the contact, shape (n, 33).
+            table: setpoints `lag` ahead of each period until the contact, shape (n, 33).
 
         Returns:
             State at the contact, shape (13,).
         """
         return flown(tuple(start.tolist()), rotors.speed, table, self._gains, self._limits(self._wide), self._narrow,
-                     CONTACT_WINDOW, self.gains.lead, self.period, self._vehicle)
+                     CONTACT_WINDOW, self.gains.lead, self.lag, self.period, self._vehicle)

@@ -89,17 +89,18 @@ def rotors_for(wrench, speed, vehicle, lead):
 
 
 @compiled
-def control_step(state, reference, speed, command, extra, gains, limits, lead, vehicle):
+def control_step(state, reference, speed, command, extra, gains, limits, lead, lag, vehicle):
     """One control period. [M:eq2]
 
-    The state is predicted to the moment at which the rotors will have answered, and the law is evaluated there.
+    The state is predicted to the moment at which the rotors have what is wanted now, and the law is evaluated there.
 
     Args:
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B now, 13 floats.
-        reference: at `lead` seconds from now, 33 floats; see `geometric_step`.
+        reference: at `lag` seconds from now, 33 floats; see `geometric_step`.
         speed, command: rotor speeds now and what they are following [rad/s], 4 floats each.
         extra, gains, limits: see `geometric_step`.
-        lead: time in which the rotors shall reach the wanted thrust [s].
+        lead: time in which the rotors would reach the wanted thrust if the command stayed [s].
+        lag: by which they follow it, where every period brings a new command [s] (`rotor_lag.lag_behind`).
         vehicle: (mass, Jx, Jy, Jz), (thrust coefficient, lowest and highest speed, time constant), moment rows (3 x 4),
             mixing columns (4 x 4), rotor drag / mass (3).
 
@@ -109,10 +110,10 @@ def control_step(state, reference, speed, command, extra, gains, limits, lead, v
     """
     mass, J = vehicle[0][0], vehicle[0][1:4]
     coefficient, _, _, tau = vehicle[1]
-    half = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * lead / tau)
+    half = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * lag / tau)
     f_mid = thrusts(approached(speed, command, half), coefficient)
     felt = drag_compensation(state[6:10], state[3:6], vehicle[4], extra)
-    ahead = predicted(state, f_mid, felt, lead, mass, J, vehicle[2])
+    ahead = predicted(state, f_mid, felt, lag, mass, J, vehicle[2])
     # The wanted velocity, not the measured one: its noise would come back as thrust.
     extra = drag_compensation(ahead[6:10], reference[3:6], vehicle[4], extra)
     thrust, M, q_C, w_C, dw_C = geometric_step(ahead, reference, extra, gains, limits, J)

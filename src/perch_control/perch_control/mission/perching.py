@@ -13,7 +13,9 @@ from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
 
-TAKEN = 0.5  # a controller that still hovers so long after a plan's start has not taken it [s]
+TAKEN = 0.5       # a controller that still hovers so long after a plan's start has not taken it [s]
+TELL_AGAIN = 0.1  # between two messages to a controller that flies on although the vehicle is attached [s]
+_FLYING_ON = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerState.RECOVERING)
 
 
 class InFlight(Protocol):
@@ -36,6 +38,7 @@ class PerchingMission(MissionMachine, Generic[R]):
     _running: R          # from the first trajectory on
     _first_id: int       # of an attempt's first trajectory; ids grow
     _first_start: float  # when that starts [s]
+    _told_at: float      # that the vehicle is attached [s]
     _off = False         # the vehicle came off after the motors had stopped
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
@@ -108,7 +111,8 @@ class PerchingMission(MissionMachine, Generic[R]):
             outputs.commands.append((Command.HOVER, "the plan was not taken"))  # nor later
             self._end(outputs, Result.REFUSED, f"the controller has not taken the plan: {inputs.controller_message}")
             return
-        self.better(inputs, outputs)
+        if not hovers:  # a controller that hovers has not begun, or was told to stay
+            self.better(inputs, outputs)
         if inputs.time > end - self.settings.contact_early:
             self._adhesion.reset()
             self._enter(Phase.VERIFYING, inputs.time, "waiting for contact")
@@ -141,6 +145,9 @@ class PerchingMission(MissionMachine, Generic[R]):
         elif self._elapsed(inputs) > self.settings.rest_time:
             result, words = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
             self._end(outputs, result, f"{words}perched", contact_time=self._contact_time)
+        elif inputs.controller in _FLYING_ON and inputs.time - self._told_at > TELL_AGAIN:
+            self._told_at = inputs.time
+            outputs.commands.append((Command.ATTACHED, "told again"))  # the first message was lost
 
     def _motors_on(self, outputs: Outputs) -> None:
         """Nothing carries the vehicle any more."""
@@ -155,6 +162,7 @@ class PerchingMission(MissionMachine, Generic[R]):
         super()._enter(phase, time, message)
         self._off = self._off and phase is Phase.RECOVERING
         if phase is Phase.PERCHED:  # however the goal ends, this is what carries the vehicle
+            self._told_at = time
             self._moves.wire = self._running.target if self._running.target.lines else None
 
     # -- plans in flight ---------------------------------------------------------------------------------------------

@@ -155,7 +155,7 @@ class NmpcController(Law):
         # At a reference's end its thrusts jump.
         left = reference.source.duration - reference.elapsed - self._lead
         ramps = self.settings.ramps and left >= _NODES * self._dt
-        ahead = 0.0 if self.thrust_states else self._lag if ramps else self._lead
+        ahead = 0.0 if self.thrust_states else self._lag
         self._rows.fill(reference.source, reference.elapsed + ahead, self._spacing, self._R)
         try:
             speed, wrench, reached = self._iterate(state, rotors, compensation, ahead, ramps)

@@ -119,12 +119,12 @@ class Tracker:
             self._follow(self._previous, image, R_now_before, slack)
             self._return_to_reference(image)
             self._thin()
-        self._previous = image
+        self._previous, noise = image, _noise(image)
         new = 0
         if len(self._pixels) < self.config.features * _REFILL:
-            new = self._refill(image)
+            new = self._refill(image, noise)
         self._choose_reference(image)
-        self.latest = Features(self._ids, self._pixels.astype(float), new, self._fit_sigma(image))
+        self.latest = Features(self._ids, self._pixels.astype(float), new, self._fit_sigma(image, noise))
         return self.latest
 
     def _follow(self, previous: np.ndarray, image: np.ndarray, R_now_before: np.ndarray, slack: float) -> None:
@@ -206,7 +206,7 @@ class Tracker:
         out[index[best]] = True
         return out
 
-    def _fit_sigma(self, image: np.ndarray) -> np.ndarray:
+    def _fit_sigma(self, image: np.ndarray, noise: float) -> np.ndarray:
         """1 sigma of the least squares fit of each feature's patch, along the axis in which it is known worst [px], shape (n,).
 
         sigma^2 = sigma_n^2 / lambda_min(sum g g^T), with sigma_n the image's noise [grey levels] and g the gradients over the
@@ -219,17 +219,16 @@ class Tracker:
         _, _, least = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
             image, image, self._pixels.reshape(-1, 1, 2), None, winSize=(_WINDOW,) * 2, maxLevel=0,
             flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
-        noise = _noise(image)
         of_noise = max(_NOISE_GRADIENT * noise**2, float(np.finfo(np.float32).tiny))
         of_scene = _KLT_EIGENVALUE * least.ravel().astype(float) - of_noise
         return noise / np.sqrt(_WINDOW**2 * np.maximum(of_scene, _NOISE_SCATTER * of_noise))
 
-    def _refill(self, image: np.ndarray) -> int:
+    def _refill(self, image: np.ndarray, noise: float) -> int:
         """Detect corners away from the features there are; those that noise alone would make are not taken.
 
         At half the resolution: the smoothing leaves nothing that needs more, and it costs a quarter.
         """
-        mask, noise = self._view[::2, ::2].copy(), _noise(image)
+        mask = self._view[::2, ::2].copy()
         for x, y in self._pixels:
             cv2.circle(mask, (round(x / 2), round(y / 2)), int(_SPACING / 2), 0, -1)
         half = cv2.pyrDown(image)
