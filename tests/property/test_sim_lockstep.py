@@ -458,3 +458,24 @@ def test_a_batch_that_is_cut_short_is_refused():
     for length in range(len(data)):
         with pytest.raises(PerchError, match="no batch"):
             unpack(data[:length], None)
+
+
+class Failing(Component[Nothing]):
+    number, said = Input(int, "number"), Output(str, "said")
+    tick = Wake(0.02)
+
+    def on_number(self, number):
+        self.said(f"{12 // number}")
+
+    def on_tick(self, now):
+        self.said(f"tick {now}")
+
+
+def test_behind_a_packet_that_a_component_fails_on_the_batch_goes_on():
+    failing = LocalParticipant(Failing(Nothing()))
+    with pytest.raises(ZeroDivisionError):
+        said(failing, 0, 3, 0, 4, 0, 6)
+    with pytest.raises(ZeroDivisionError):
+        failing.results()
+    assert [packet.value for packet in failing.results()] == ["4", "3", "2", "tick 0"]
+    assert said(failing, 20 * MS, 12) == ["1", "tick 20000000"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Wake, ports, run_now
@@ -154,7 +154,7 @@ class LocalParticipant(Participant):
         self._outside: deque[Callable[[], None]] = deque()  # requests and goals, in front of the next batch
         self._awaited: list[_Awaited] = []
         self._now, self._begun = 0, False
-        self._batch: Sequence[Packet] | None = None
+        self._batch: Iterator[Packet] | None = None  # what is left of it
         self._hold = hold
         if hold and hold not in (port.name for port in ports(kind, Action)):
             raise PerchError(f"{self.name}: {hold!r} is none of its actions")
@@ -168,7 +168,7 @@ class LocalParticipant(Participant):
         """Work on a batch, or wait for what it needs."""
         if now > BEGUN:
             self._hold = ""
-        self._now, self._batch, self._begun = now, batch, True
+        self._now, self._batch, self._begun = now, iter(batch), True
         self._go_on()
 
     def results(self) -> list[Packet] | None:
@@ -188,14 +188,14 @@ class LocalParticipant(Participant):
             if self._hold or not all(awaited.answer.done() for awaited in self._awaited if awaited.due <= self._now):
                 return
             self._take_what_came()
-        now, batch, self._batch = self._now, self._batch or (), None
-        handle = self._handlers
-        for packet in batch:
+        now, handle = self._now, self._handlers
+        for packet in self._batch or ():  # where the component fails on one, the next call goes on with those behind it
             handle[packet.channel](packet.value)
         for wake in self._wakes:
             if now >= wake[0]:
                 wake[0] = wake[0] + wake[1] if wake[0] + wake[1] > now else now + wake[1]
                 wake[2](now)
+        self._batch = None
 
     def _take_what_came(self) -> None:
         while self._outside:
