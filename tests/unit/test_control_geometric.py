@@ -13,6 +13,7 @@ from perch_control.geometric.law import attitude_error, geometric_step
 from perch_control.geometric.step import predicted
 from perch_control.reference import FlatReference, SampledReference, Setpoint, packed_many
 from perch_control.rotor_lag import RotorEstimate, leading_command, reachable, thrusts
+from perch_core import so3
 from perch_core.flatness import flat_to_state, heading_derivatives
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.vehicle import ControlGains, load_vehicle
@@ -174,6 +175,27 @@ def test_sampled_reference_gives_the_flat_references_setpoints():
             np.testing.assert_allclose(getattr(y, key), getattr(x, key), atol=tolerance, err_msg=key)
         f = np.array(x.a) + (0, 0, 9.81)
         np.testing.assert_allclose(np.cross(np.cross(x.h, f), np.cross(y.h, f)), 0.0, atol=1e-2)
+
+
+def test_setpoints_of_full_states_are_their_states_and_hold_the_last_acceleration():
+    """Between unevenly spaced samples, against so3 and finite differences of the attitude."""
+    rng = np.random.default_rng(4)
+    times = np.array([0.0, 0.05, 0.12, 0.2])
+    p, v, w, a, dw = rng.normal(size=(5, 4, 3))
+    x = SampledTrajectory(times, p, Rotation.random(4, random_state=4).as_quat(), v, w, a, dw, rng.uniform(1.0, 3.0, (4, 4)))
+    source = SampledReference(x, 2.0)
+    for t in (0.0, 0.03, 0.05, 0.16, 0.2):
+        state, found = x.sample(t), source.setpoint(t)
+        R, specific = so3.quat_to_matrix(state.q), state.rotor_thrust.sum() / 2.0
+        W, dW = so3.hat(state.w), so3.hat(state.dw)
+        for got, wanted in ((found.p, state.p), (found.v, state.v), (found.a, specific * R[:, 2] - (0.0, 0.0, 9.81)), (found.h, R[:, 1]),
+                            (found.b3, R[:, 2]), (found.dh, (R @ W)[:, 1]), (found.ddb3, (R @ (W @ W + dW))[:, 2])):
+            np.testing.assert_allclose(got, wanted, atol=1e-9)
+    end, after = source.setpoint(0.2), source.setpoint(0.3)
+    np.testing.assert_allclose(after.v, np.add(end.v, 0.1 * np.array(end.a)), atol=1e-9)
+    np.testing.assert_allclose(after.p, np.array(end.p) + 0.1 * np.array(end.v) + 0.005 * np.array(end.a), atol=1e-9)
+    assert after.a == end.a and np.abs(after.dh).max() == np.abs(after.ddb3).max() == 0.0
+    np.testing.assert_allclose(packed_many(source, times), [source.setpoint(t).packed for t in times], atol=1e-9)
 
 
 def test_many_setpoints_are_the_single_ones():

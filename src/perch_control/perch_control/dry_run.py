@@ -16,8 +16,8 @@ from perch_control.l1 import L1Augmentation
 from perch_control.maneuvers import recovered
 from perch_control.modes import Command, State
 from perch_control.period import NOMINAL_PERIOD
-from perch_control.reference import FlatReference, Vector
-from perch_core.trajectory import rest_to_rest
+from perch_control.reference import FlatReference, SampledReference, Vector
+from perch_core.trajectory import SampledTrajectory, rest_to_rest
 from perch_core.vehicle import GRAVITY, ControlGains, Vehicle
 
 _RISE = 1.0  # [s]
@@ -37,11 +37,19 @@ class _DryRun:
             self.flight.imu(self.time, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY))
             self.flight.step(self.time, (*p, *v, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
 
-    def follow(self, id: int, end: float, at_end: AtEnd) -> None:
+    def rise(self, id: int, end: float, at_end: AtEnd) -> None:
         """Take a trajectory to a height [m]."""
-        start = self.time + NOMINAL_PERIOD
-        path = rest_to_rest(np.array(self._expected()[0]), np.array([0.0, 0.0, end]), 0.0, 0.0, _RISE, start_time=start)
-        self.flight.follow(Order(id, FlatReference(path), start, at_end))
+        self._follow(id, FlatReference(rest_to_rest(np.array(self._expected()[0]), np.array([0.0, 0.0, end]), 0.0, 0.0, _RISE)), at_end)
+
+    def stay(self, id: int, at_end: AtEnd) -> None:
+        """Take a trajectory of full states that stays where the vehicle is."""
+        mass, still = self.flight.vehicle.mass, np.zeros((2, 3))
+        path = SampledTrajectory(np.array([0.0, _RISE]), np.tile(self._expected()[0], (2, 1)), np.tile((0.0, 0.0, 0.0, 1.0), (2, 1)), still,
+                                 still, still, still, np.full((2, 4), mass * GRAVITY / 4))
+        self._follow(id, SampledReference(path, mass), at_end)
+
+    def _follow(self, id: int, source: FlatReference | SampledReference, at_end: AtEnd) -> None:
+        self.flight.follow(Order(id, source, self.time + NOMINAL_PERIOD, at_end))
 
     def _expected(self) -> tuple[Vector, Vector]:
         """Position [m] and velocity [m/s]; at rest on the ground before the first order."""
@@ -52,7 +60,7 @@ class _DryRun:
 
 
 def dry_run(vehicle: Vehicle, gains: ControlGains, settings: FlightSettings) -> list[State]:
-    """Arm, rise, hover, begin a perch, recover, land, and descend without position, a few periods each.
+    """Arm, rise, hover, begin a perch of either form of plan, recover, land, and descend without position, a few periods each.
 
     Returns:
         The states that it has been in.
@@ -63,10 +71,12 @@ def dry_run(vehicle: Vehicle, gains: ControlGains, settings: FlightSettings) -> 
     run.step()
     flight.command(Command.ARM)
     seen.append(flight.state)
-    run.follow(1, 0.2, AtEnd.HOLD)
+    run.rise(1, 0.2, AtEnd.HOLD)
     run.step(round(_RISE / NOMINAL_PERIOD) + 5)
     seen.append(flight.state)
-    run.follow(2, 0.4, AtEnd.CONTACT)
+    run.stay(2, AtEnd.CONTACT)
+    run.step()
+    run.rise(3, 0.4, AtEnd.CONTACT)
     run.step()
     seen.append(flight.state)
     flight.flown = recovered(flight.flown, "dry run")

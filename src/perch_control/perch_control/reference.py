@@ -6,15 +6,17 @@ A source is anything with `duration` and `setpoint(t)`, t in seconds since its s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from perch_core import bernstein, so3
-from perch_core.arrays import vector3
+from perch_core import bernstein
+from perch_core.arrays import Array
 from perch_core.flatness import heading_derivatives
 from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
+from perch_core.vector3 import axes_of, axpy, cross, rotation_vector, scale, turned
 from perch_core.vehicle import GRAVITY
 
 Vector = tuple[float, ...]
@@ -173,6 +175,74 @@ def with_unit_quaternions(trajectory: SampledTrajectory) -> SampledTrajectory:
     return trajectory if off < 1e-9 else trajectory.normalised()
 
 
+@compiled
+def _place(at, t):
+    """Index k of the sample before a time, and the share of the way to the next one."""
+    k = min(max(np.searchsorted(at, t, side="right") - 1, 0), len(at) - 2)
+    return k, min(max((t - at[k]) / (at[k + 1] - at[k]), 0.0), 1.0)
+
+
+@compiled
+def _between(values, k, u):
+    """Linear between samples k and k + 1, shapes (n, 3) -> 3 floats."""
+    return axpy(1.0 - u, values[k], scale(u, values[k + 1]))
+
+
+@compiled
+def _specific_at(at, specific, t):
+    k, u = _place(at, t)
+    return (1.0 - u) * specific[k] + u * specific[k + 1]
+
+
+@compiled
+def _in_world(b1, b2, b3, c):
+    """Components in B as a vector in W."""
+    return axpy(c[0], b1, axpy(c[1], b2, scale(c[2], b3)))
+
+
+@compiled
+def _sampled_setpoints(at, p, v, q, w, dw, specific, times, out):
+    """Setpoints of full states at the times `at` [s], shape (n,), at `times` [s], shape (m,): packed, in `out`, shape (m, 33).
+
+    With f the specific collective thrust `specific` [m/s^2], shape (n,):
+
+        a = f b3 + g,  j = f' b3 + f b3',  s = 2 f' b3' + f b3'',  b_i' = R (w x e_i),  b_i'' = R (w x (w x e_i) + dw x e_i)
+    """
+    end, half = at[-1], 0.5 * (at[1] - at[0])
+    for m in range(len(times)):
+        t = times[m]
+        over = max(t - end, 0.0)
+        k, u = _place(at, t)
+        f, rate, turning, acceleration = (1.0 - u) * specific[k] + u * specific[k + 1], 0.0, _ZERO, _ZERO
+        if over == 0.0:
+            turning, acceleration = _between(w, k, u), _between(dw, k, u)
+            before, after = max(t - half, 0.0), min(t + half, end)
+            if after > before:
+                rate = (_specific_at(at, specific, after) - _specific_at(at, specific, before)) / (after - before)
+        b1, b2, b3 = axes_of(turned(q[k], scale(u, rotation_vector(q[k], q[k + 1]))))
+        e2, e3 = cross(turning, (0.0, 1.0, 0.0)), cross(turning, (0.0, 0.0, 1.0))
+        dh, db3 = _in_world(b1, b2, b3, e2), _in_world(b1, b2, b3, e3)
+        ddh = _in_world(b1, b2, b3, axpy(1.0, cross(turning, e2), cross(acceleration, (0.0, 1.0, 0.0))))
+        ddb3 = _in_world(b1, b2, b3, axpy(1.0, cross(turning, e3), cross(acceleration, (0.0, 0.0, 1.0))))
+        a = axpy(f, b3, (0.0, 0.0, -GRAVITY))
+        velocity = _between(v, k, u)
+        place = axpy(over, axpy(0.5 * over, a, velocity), _between(p, k, u))
+        parts = (place, axpy(over, a, velocity), a, axpy(rate, b3, scale(f, db3)), axpy(2.0 * rate, db3, scale(f, ddb3)),
+                 b2, dh, ddh, b3, db3, ddb3)
+        for n in range(11):
+            for i in range(3):
+                out[m, 3 * n + i] = parts[n][i]
+
+
+@compiled
+def _sampled_setpoint(at, p, v, q, w, dw, specific, t):
+    """`_sampled_setpoints` at one time [s], as `fields`."""
+    times, out = np.empty(1), np.empty((1, 33))
+    times[0] = t
+    _sampled_setpoints(at, p, v, q, w, dw, specific, times, out)
+    return fields(out[0])
+
+
 @dataclass(frozen=True)
 class SampledReference:
     """Full states with rotor thrusts, brought to the same form: jerk and snap follow from the attitude's motion and the
@@ -186,31 +256,20 @@ class SampledReference:
         """[s]"""
         return self.trajectory.duration
 
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+        x = self.trajectory
+        return x.times, x.p, x.v, x.q, x.w, x.dw, x.rotor_thrust.sum(axis=1) / self.mass
+
+    def many(self, times: np.ndarray) -> np.ndarray:
+        """Setpoints at many times [s], packed, shape (n, 33)."""
+        out = np.empty((len(times), 33))
+        _sampled_setpoints(*self._arrays, times, out)
+        return out
+
     def setpoint(self, t: float) -> Setpoint:
         """Setpoint at a time [s]; past the end the last acceleration holds."""
-        end = self.trajectory.duration
-        x = self.trajectory.sample(t)
-        R = so3.quat_to_matrix(x.q)
-        w, dw = x.w, x.dw
-        over = max(t - end, 0.0)
-        specific = float(np.sum(x.rotor_thrust)) / self.mass
-        span = 0.5 * float(self.trajectory.times[1] - self.trajectory.times[0])
-        before, after = max(t - span, 0.0), min(t + span, end)
-        rate = 0.0
-        if over > 0.0:
-            w, dw = np.zeros(3), np.zeros(3)
-        elif after > before:
-            change = self.trajectory.sample(after).rotor_thrust - self.trajectory.sample(before).rotor_thrust
-            rate = float(np.sum(change)) / (after - before) / self.mass
-        W = so3.hat(w)
-        turn, turn2 = R @ W, R @ (W @ W + so3.hat(dw))  # R', R''
-        b3, db3, ddb3 = R[:, 2], turn[:, 2], turn2[:, 2]
-        a = specific * b3 - np.array([0.0, 0.0, GRAVITY])
-        j = rate * b3 + specific * db3
-        s = 2.0 * rate * db3 + specific * ddb3
-        p, v = x.p + over * (x.v + 0.5 * over * a), x.v + over * a
-        return Setpoint(vector3(p), vector3(v), vector3(a), vector3(j), vector3(s), vector3(R[:, 1]),
-                        vector3(turn[:, 1]), vector3(turn2[:, 1]), vector3(b3), vector3(db3), vector3(ddb3))
+        return Setpoint._make(_sampled_setpoint(*self._arrays, t))
 
 
 def peak_thrust(source, begin: float) -> float:

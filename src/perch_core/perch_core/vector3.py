@@ -5,7 +5,7 @@ At 500 Hz numpy's cost per call on three numbers would be most of the controller
 
 from __future__ import annotations
 
-from math import cos, sin, sqrt
+from math import atan2, cos, sin, sqrt
 
 from perch_core.arrays import Numbers, Quaternion, Vector3
 from perch_core.jit import compiled
@@ -86,6 +86,15 @@ def turned(q: Numbers, phi: Numbers) -> Quaternion:
     out = quaternion_product(q, (k * phi[0], k * phi[1], k * phi[2], cos(0.5 * angle)))
     n = 1.0 / sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
     return (n * out[0], n * out[1], n * out[2], n * out[3])
+
+
+@compiled
+def rotation_vector(a: Numbers, b: Numbers) -> Vector3:
+    """The shortest rotation from one unit quaternion to another, in the first one's axes [rad]: `turned(a, phi)` is b or -b."""
+    x, y, z, w = quaternion_product((-a[0], -a[1], -a[2], a[3]), b)
+    sine = sqrt(x * x + y * y + z * z)
+    k = 2.0 if sine < 1e-9 else 2.0 * atan2(sine, abs(w)) / sine
+    return scale(k if w >= 0.0 else -k, (x, y, z))
 
 
 @compiled
