@@ -187,6 +187,17 @@ def test_a_node_that_hangs_before_it_was_ever_heard_is_named(mission, pilot, mon
     assert [message for message in told if "silent" in message] == ["/mission has been silent for 0.5 s"]  # others are not there, or speak
 
 
+def test_a_node_of_a_process_in_which_others_speak_is_not_called_silent(mission, pilot, monkeypatch):
+    monkeypatch.setattr(client_module, "SILENT", 0.5)
+    others = [DiagnosticStatus(name="/estimator", hardware_id=""), DiagnosticStatus(name="/vio", hardware_id="another")]
+    pilot.spin_until(lambda: mission.diagnostics.publish(DiagnosticArray(status=others)) or "/vio" in pilot.processes, 60.0)
+    news, end = [], time.monotonic() + 60.0
+    while not news and time.monotonic() < end:
+        pilot.spin(0.1)
+        news = pilot.news()
+    assert news == ["/vio has been silent for 0.5 s"]
+
+
 def test_time_that_stands_still_for_long_ends_the_flight_and_names_who_owes(mission, pilot, monkeypatch):
     mission.passes.set()
     hear_who_owes(pilot)

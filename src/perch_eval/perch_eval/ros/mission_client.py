@@ -104,10 +104,17 @@ class MissionClient(GraphNode):
                                        topics.topic("/diagnostics").qos.subscribe)
 
     def news(self) -> list[str]:
-        """Which nodes, since the last call, have been started anew, or have fallen silent though others speak: they hang, or have ended."""
+        """Which nodes, since the last call, have been started anew, or have fallen silent though others speak: they hang, or have ended.
+
+        Nodes of one process take turns: where one of them speaks, the others have but to wait.
+        """
         now, (news, self._news) = time.monotonic(), (self._news, [])
         if now - max(self._heard.values(), default=0.0) < 0.5 * SILENT:
-            silent = {name for name, heard in self._heard.items() if now - heard > SILENT}
+            spoke: dict[str, float] = {}
+            for name, heard in self._heard.items():
+                process = self.processes.get(name, name)
+                spoke[process] = max(heard, spoke.get(process, 0.0))
+            silent = {name for name in self._heard if now - spoke[self.processes.get(name, name)] > SILENT}
             news += [f"{name} has been silent for {SILENT:g} s" for name in sorted(silent - self._silent)]
             self._silent = silent
         return news
