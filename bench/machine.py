@@ -12,7 +12,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 from perch_core.ros.priority import PRIORITY
-from perch_core.timing import CONTROL_PERIOD_NS
+from perch_sim.timing import CONTROL_PERIOD_NS
 
 AWAKE, REST = 0.004, 0.001  # s; a core that spins, and then sleeps for as long as a host does not mind
 

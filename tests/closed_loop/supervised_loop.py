@@ -16,7 +16,7 @@ from perch_autopilot.supervised_link import COMMAND, LinkSupervisor
 from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.watchdog import DESCENT, OFF, ON, Watchdog
 from perch_core import so3
-from perch_core.timing import CONTROL_PERIOD_NS
+from perch_sim.timing import CONTROL_PERIOD_NS
 from perch_core.values import NANOSECONDS
 from perch_core.vehicle import Vehicle
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from perch_core.component import Action, Client, Component, Input, Service, Wake, ports
-from perch_core.timing import CONTROL_PERIOD
+from perch_sim.timing import CONTROL_PERIOD
 from perch_core.values import CameraImage
 from perch_eval.goal import goal_of
 from perch_eval.in_process.flights import Sensing, arrange

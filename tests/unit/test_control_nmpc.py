@@ -27,7 +27,7 @@ from perch_core import so3
 from perch_core.compiled import compiler
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import RotorModel
-from perch_core.timing import CONTROL_PERIOD
+from perch_sim.timing import CONTROL_PERIOD
 from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import ControlGains, load_vehicle
 from perch_planner.powerline import problem
@@ -201,6 +201,14 @@ def test_rotors_that_are_led_anew_in_every_period_are_late_by_less_than_the_lead
         speed = approached(speed, command, step)
     assert behind == pytest.approx(lag_behind(tau, lead, CONTROL_PERIOD), rel=1e-3) and behind < lead
     assert lag_behind(0.0, lead, CONTROL_PERIOD) == CONTROL_PERIOD, "without a lag: what is commanded now"
+
+
+def test_the_law_that_stands_in_keeps_the_pace_of_the_odometry():
+    law = predictive(RPG)
+    law.pace(0.004)
+    assert law.fallback.period == 0.004
+    law.retune(law.settings, GeometricController(RPG, ControlGains()))
+    assert law.fallback.period == 0.004
 
 
 def test_perch_with_estimation_errors():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from perch_core.ros.deadlines import MOVED, WINDOW, Deadlines, durations_us, median_and_p99
-from perch_core.timing import CONTROL_PERIOD_NS as PERIOD
+from perch_sim.timing import CONTROL_PERIOD_NS as PERIOD
 
 START = 1_000_000_000  # stamp of the first step [ns]
 AHEAD = 77_000_000_000  # of the monotonic clock, unknown to the node [ns]

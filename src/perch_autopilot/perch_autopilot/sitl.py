@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from perch_core.arrays import Numbers
-from perch_core.timing import CONTROL_PERIOD
+from perch_sim.timing import CONTROL_PERIOD
 from perch_autopilot import firmware, msp
 from perch_autopilot.configuration import Cli, CliError, Configuration
 from perch_autopilot.firmware import FirmwareError

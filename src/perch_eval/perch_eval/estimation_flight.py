@@ -17,7 +17,7 @@ from perch_core import so3
 from perch_core.camera_mount import CameraMount
 from perch_core.component import Component, Input, Output
 from perch_core.processes import frozen_heap
-from perch_core.timing import CONTROL_PERIOD
+from perch_sim.timing import CONTROL_PERIOD
 from perch_core.urdf import optical_frame
 from perch_core.values import CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState
 from perch_core.vehicle import load_vehicle

@@ -15,7 +15,7 @@ import numpy as np
 
 from perch_core.jit import compiled
 from perch_core.registry import resolved
-from perch_core.timing import CONTROL_PERIOD
+from perch_sim.timing import CONTROL_PERIOD
 from perch_core.vehicle import Vehicle
 from perch_sim.imu import ImuSample
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
+from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.values import Contact
 from perch_core.vehicle import Vehicle
 from perch_sim import seeding

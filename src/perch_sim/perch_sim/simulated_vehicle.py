@@ -12,7 +12,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
 from perch_core.errors import ConfigError, PerchError
-from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
+from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
     NANOSECONDS, AttitudeThrust, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RatesThrust, RotorState,

@@ -18,7 +18,7 @@ import numpy as np
 
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
-from perch_core.timing import CONTROL_PERIOD_NS
+from perch_sim.timing import CONTROL_PERIOD_NS
 from perch_core.values import NANOSECONDS, Contact
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_sim import seeding

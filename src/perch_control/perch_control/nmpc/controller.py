@@ -18,7 +18,7 @@ from perch_control.nmpc.riccati import Workspace
 from perch_control.nmpc.settings import NmpcSettings
 from perch_control.period import NOMINAL_PERIOD
 from perch_control.reference import ByState, Following, Resting
-from perch_control.rotor_lag import RotorEstimate, lag_behind
+from perch_control.rotor_lag import RotorEstimate
 from perch_core.errors import ConfigError
 from perch_core.jit import COMPILED
 from perch_core.vehicle import Vehicle
@@ -91,7 +91,7 @@ class NmpcController(Law):
         s, n = self.settings, self._layout.states
         self._lead = self.fallback.gains.lead
         self._rate_max, self._thrust_rate_max = _RATE_RESERVE * self._nominal.body_rate_max, _thrust_rate(self.vehicle)
-        self._lag = lag_behind(self.vehicle.motor_time_constant, self._lead, self.period)
+        self.fallback.pace(self.period)
         z = self._stages.arguments
         k = n + INPUTS + REFERENCE + DISTURBANCE
         z[:, k:k + WEIGHTS] = (*s.position, *s.velocity, *s.attitude, *s.rate, s.thrust)
@@ -155,7 +155,7 @@ class NmpcController(Law):
         # At a reference's end its thrusts jump.
         left = reference.source.duration - reference.elapsed - self._lead
         ramps = self.settings.ramps and left >= _NODES * self._dt
-        ahead = 0.0 if self.thrust_states else self._lag
+        ahead = 0.0 if self.thrust_states else self.fallback.lag
         self._rows.fill(reference.source, reference.elapsed + ahead, self._spacing, self._R)
         try:
             speed, wrench, reached = self._iterate(state, rotors, compensation, ahead, ramps)

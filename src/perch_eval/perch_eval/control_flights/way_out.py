@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_core.timing import CONTROL_PERIOD
+from perch_sim.timing import CONTROL_PERIOD
 from perch_sim.plant import Plant
 
 SWITCHES = (0.02, 0.04, 0.06, 0.09, 0.13)  # the second command may begin so long after the fault [s]

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, Protocol, cast
 
 from perch_core.component import Component
 from perch_core.errors import PerchError
-from perch_core.timing import CONTROL_PERIOD_NS
+from perch_sim.timing import CONTROL_PERIOD_NS
 from perch_core.values import CameraImage
 from perch_sim.lockstep.batches import Arrival, Batch, Place, first_undrawn, is_drawn, is_lost
 from perch_sim.lockstep.packet import Codec, Packet

@@ -12,7 +12,7 @@ from perch_core.ros import topics
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import SHARED
 from perch_core.ros.wiring import Publication, Wiring, foreign_writers
-from perch_core.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
+from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.values import CameraImage
 from perch_sim.lockstep import BEGUN, Schedule, flight_tasks
 from perch_sim.lockstep.link import Door, Waiting, address
