@@ -47,3 +47,8 @@ def test_what_was_flown_before_a_soak_was_killed_is_kept(tmp_path, monkeypatch):
         soak.main(["--out", str(tmp_path), "--logs", str(tmp_path)])
     assert "20 of 20 flights perched and departed" in (tmp_path / "README.md").read_text()
     assert (tmp_path / "surface_90.json").exists() and (tmp_path / "surface_90.png").exists()
+
+
+def test_equal_problems_are_one_line():
+    problems = ["flight 3: missed", "flight 9: missed", "composed: +2.00 MB per 100 flights", "flight 10: timeout"]
+    assert soak._grouped(problems) == ["flights 3, 9: missed", "composed: +2.00 MB per 100 flights", "flight 10: timeout"]

@@ -213,10 +213,19 @@ def page(folder: Path) -> str:
                       *(f"{low}" if low == high else f"{low} to {high}" for low, high in (of["descriptors"], of["threads"])))
                      for name, of in run["growth"].items()))]
         shared = [flight["shared"] for flight in run["flights"]]
-        bad = [f"* {problem}" for problem in run["problems"]]
-        verdict = ["Not as it should be:", "", *bad] if bad else ["All as it should be."]
+        bad = _grouped(run["problems"])
+        verdict = ["Not as it should be:", "", *(f"* {problem}" for problem in bad)] if bad else ["All as it should be."]
         text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB.", *verdict, "", f"![{file.stem}]({file.stem}.png)"]
     return "\n".join(text) + "\n"
+
+
+def _grouped(problems: list[str]) -> list[str]:
+    """Equal problems of several flights as one."""
+    flights: dict[str, list[str]] = {}
+    for problem in problems:
+        flight, _, words = problem.removeprefix("flight ").partition(": ") if problem.startswith("flight ") else ("", "", problem)
+        flights.setdefault(words, []).append(flight)
+    return [words if numbers == [""] else f"flight{'s' if len(numbers) > 1 else ''} {', '.join(numbers)}: {words}" for words, numbers in flights.items()]
 
 
 def parser() -> argparse.ArgumentParser:
