@@ -54,6 +54,16 @@ def test_the_exit_code_tells_failed_claims_and_missing_rows(tmp_path, monkeypatc
     assert not [line for line in page.splitlines() if line.startswith("|") and "1 | 2" in line]  # a cell keeps its table whole
 
 
+@pytest.mark.slow
+def test_parts_have_their_places_on_the_page_whatever_order_they_are_asked_for_in(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    parts = dict.fromkeys("abc", part(True))
+    monkeypatch.setattr(command, "PARTS", {name: name for name in parts})
+    monkeypatch.setattr(command, "resolved", lambda place: parts[place.rpartition(".")[2]])
+    assert command.main(["--only", "c", "--only", "a", "--out", "results"]) == 0
+    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("[")] == ["[1/2] a", "[2/2] c"]
+
+
 @pytest.mark.parametrize("arguments", [["--jobs", "0"], ["--seeds", "-1"], ["--line-seeds", "many"], ["--quick", "--full"]])
 def test_wrong_arguments_are_the_callers_mistake(arguments):
     with pytest.raises(SystemExit) as end:

@@ -62,7 +62,7 @@ def _regenerate(args: argparse.Namespace) -> int:
                     range(1, 1 + counts["seeds"]), range(1, 1 + counts["line-seeds"]), counts["layouts"])
     began = time.monotonic()
     output_folder(args.out)
-    sections = evaluate(effort, args.only or [name for name in PARTS if args.full or name not in BEYOND_PAPERS])
+    sections = evaluate(effort, [name for name in PARTS if (name in args.only if args.only else args.full or name not in BEYOND_PAPERS)])
     document.write(sections, effort, time.monotonic() - began)
     found = document.counts(sections)
     print(f"results: {args.out / 'README.md'}: " + ", ".join(f"{n} {verdict}" for verdict, n in found.items()))
