@@ -177,7 +177,7 @@ def page(results: Mapping[str, Figures], command: str) -> list[str]:
     def arcs(key: str) -> list[str]:
         return row(key, lambda f: f"{f['ours']['arcs']} arcs in {f['ours']['photographs']} photographs", ", without wires")
 
-    lines = ["# Perception on recordings", "", banner(commit()), "", f"Made by `{command}` on {machine()}. This page is generated.",
+    lines = ["# Perception on recordings", "", banner([commit()], [digest()]), "", f"Made by `{command}` on {machine()}. This page is generated.",
              INTRODUCTION, *table("recording | what it is | source | licence", (
                  (r.title, r.about, ", ".join(f"`{p}`" for p in r.paths) or "this repository", r.licence) for r in RECORDINGS.values())),
              ODOMETRY, *table("recording | compared | ATE | at the end | attitude | NEES (3) | restarts", (

@@ -134,7 +134,7 @@ def test_rows_of_other_code_are_flown_again_and_dropped(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("code, older", [("now", False), ("before", True)])
 def test_the_page_says_whether_its_rows_are_of_this_code(monkeypatch, code, older):
-    monkeypatch.setattr(campaign, "digest", lambda: "now")
+    monkeypatch.setattr("perch_eval.revision.digest", lambda: "now")
     assert ("older than the code" in campaign.page([row(code=code)])) == older
 
 

@@ -36,10 +36,9 @@ def test_a_page_of_other_code_says_so(page):
 
 
 def test_a_page_is_marked_once_the_code_has_changed(tmp_path, monkeypatch):
-    monkeypatch.setattr(revision, "commit", lambda: "1234567")
     monkeypatch.setattr(revision, "digest", lambda: "0123456789ab")
     page = tmp_path / "page.md"
-    page.write_text(f"# Results\n\n{revision.banner('1234567')}\n\n## A table\n")
+    page.write_text(f"# Results\n\n{revision.banner(['1234567'], ['0123456789ab'])}\n\n## A table\n")
     assert page.read_text().splitlines()[2] == (
         "> **Of commit 1234567** (digest 0123456789ab). What has changed since: `git diff --stat 1234567 -- src config requirements`")
     assert revision.mark([page]) == []
@@ -48,10 +47,13 @@ def test_a_page_is_marked_once_the_code_has_changed(tmp_path, monkeypatch):
     assert "> **Of commit 1234567, older than the code** (digest 0123456789ab)." in page.read_text()
 
 
-def test_results_of_several_commits_are_older_than_the_code():
-    text = revision.banner("13d2870+, cde665f")
-    assert "Of commits 13d2870+, cde665f, older than the code**" in text and "git diff --stat 13d2870 -- src config requirements" in text
-    assert not revision.out_of_date(text, NOW)
+def test_results_are_of_the_code_whose_digest_they_have_whatever_was_committed_meanwhile(monkeypatch):
+    monkeypatch.setattr(revision, "digest", lambda: "0123456789ab")
+    text = revision.banner(["cde665f", "13d2870+", "cde665f"], ["0123456789ab"] * 3)
+    assert "> **Of commits 13d2870+, cde665f** (digest 0123456789ab)." in text and "git diff --stat 13d2870 -- src" in text
+    for codes in (["0123456789ab", "ba9876543210"], [""], []):
+        older = revision.banner(["cde665f"], codes)
+        assert "Of commit cde665f, older than the code**." in older and not revision.out_of_date(older, "0123456789ab")
 
 
 def test_the_front_page_shows_what_the_pages_of_results_say():

@@ -9,7 +9,7 @@ import hashlib
 import re
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from perch_core.config import config_dir
@@ -49,17 +49,17 @@ def made_of() -> dict[str, str]:
     return {"commit": commit(), "digest": digest()}
 
 
-def banner(commits: str) -> str:
+def banner(commits: Collection[str], codes: Collection[str]) -> str:
     """First lines of a page of results: its commits, whether they are older than the code, and how to see the changes.
 
     Args:
-        commits: as `commit()` gave them when the results were made, separated by commas.
+        commits: as `commit()` gave them when the results were made.
+        codes: as `digest()` gave them; empty words where that is not known.
     """
-    several = "," in commits
-    of = f"(digest {digest()})" if commits == commit() else ""
-    first = commits.partition("+")[0].partition(",")[0].partition(" ")[0]
-    return (f"> **Of commit{'s' * several} {commits}{'' if of else OLDER}** {of}".rstrip()
-            + f". What has changed since: `git diff --stat {first} -- {' '.join(CODE)}`")
+    now, several = digest(), "s" * (len(set(commits)) > 1)
+    of = f"** (digest {now})" if now and set(codes) == {now} else f"{OLDER}**"
+    first = min(commits, default="").partition("+")[0]
+    return f"> **Of commit{several} {', '.join(sorted(set(commits)))}{of}. What has changed since: `git diff --stat {first} -- {' '.join(CODE)}`"
 
 
 def out_of_date(page: str, now: str) -> bool:

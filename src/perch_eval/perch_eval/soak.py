@@ -196,7 +196,7 @@ def plot(flights: Sequence[Flight], file: Path) -> None:
 def page(folder: Path) -> str:
     """The page of all soaks whose figures lie in a folder."""
     runs = {file: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
-    text = ["# Soak", "", banner(", ".join(sorted({run["commit"] for run in runs.values()}))), "",
+    text = ["# Soak", "", banner([run["commit"] for run in runs.values()], [run.get("digest", "") for run in runs.values()]), "",
             "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart,",
             f"perch again. Growth of memory by least squares over the flights after the first {SETTLED}; bar: {BAR:g} MB per 100 flights,",
             "descriptors and threads constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]

@@ -10,7 +10,7 @@ from typing import Any
 
 from perch_core.json_values import write_json
 from perch_eval.evaluation.sections import BETTER, FAILS, HOLDS, MISSING, VACUOUS, WORSE, Effort, Section
-from perch_eval.revision import banner, commit, made_of
+from perch_eval.revision import banner, commit, digest, made_of
 
 _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: "*not available*"}
 
@@ -25,7 +25,7 @@ def write(sections: Sequence[Section], effort: Effort, duration: float) -> None:
 
 def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, Any], data: str = "") -> None:
     """A page among the results, with commit, command and machine below its heading, and its figures as JSON with the same; `data`: another name of these."""
-    made_by = [banner(commit()), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
+    made_by = [banner([commit()], [digest()]), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
     (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by, *lines[1:]]) + "\n")
     write_json(effort.out / f"{data or name}.json", {**made_of(), "command": effort.command, "machine": machine(), **content})
 
