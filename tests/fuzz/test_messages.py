@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,8 @@ PLAYERS = [("surface", name) for name in ("estimator", "controller", "mission", 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.stem)
 def test_what_was_found_stays_mended(case):
-    replay(case.read_text())
+    count = replay(case.read_text())
+    assert count["refused"] + count["taken"] == len(json.loads(case.read_text())["sent"])
 
 
 @pytest.mark.parametrize("flight, name", PLAYERS, ids=[name for _, name in PLAYERS])
