@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,9 @@ PLAYERS = [("surface", name) for name in ("estimator", "controller", "mission", 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.stem)
 def test_what_was_found_stays_mended(case):
-    replay(case.read_text())
+    text = case.read_text()
+    count = replay(text)
+    assert count["refused"] + count["taken"] == len(json.loads(text)["sent"])
 
 
 @pytest.mark.parametrize("flight, name", PLAYERS, ids=[name for _, name in PLAYERS])
@@ -36,3 +39,9 @@ def test_the_oracles_know_nonsense(monkeypatch):
     monkeypatch.setattr("perch_core.component.problem", lambda value: "")
     with pytest.raises(Nonsense, match="has moved the outputs"):
         play("surface", "estimator", shaken, True, imu + 50)
+    monkeypatch.setattr(messages, "drawn", lambda flight, name, seed: (shaken, True, imu + 50))
+    with pytest.raises(Nonsense) as found:
+        hunt("surface", "estimator", 0)
+    assert '"on_imu"' in found.value.case
+    with pytest.raises(Nonsense, match="has moved the outputs"):
+        replay(found.value.case)

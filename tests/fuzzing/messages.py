@@ -295,20 +295,27 @@ def hunt(flight: str, name: str, seed: int) -> Counter[str]:
         except Nonsense as error:
             sent, problem = fewer, error
             break
-    case = {"flight": flight, "component": name, "strict": strict, "last": last, "sent": sent}
+    events = recorded(flight)[name]
+    kept = [(one.at, events[one.of].method, one.of, one.ways) for one in sent]
+    case = {"flight": flight, "component": name, "strict": strict, "last": last, "sent": kept}
     raise Nonsense(f"{flight} {name}: {problem}\n{problem.args[0].strip().splitlines()[-1]}", json.dumps(case)) from None
 
 
-def replay(case: str) -> None:
-    """Play a case that was found.
+def replay(case: str) -> Counter[str]:
+    """Play a case that was found, with the events of the same inputs that are nearest to its own: a flight changes with the code.
+
+    Returns:
+        As `play`.
 
     Raises:
         Nonsense: it is one still.
     """
     found = json.loads(case)
-    sent = [Spoilt(at, of, tuple(Way(tuple(path), kind, value) for path, kind, value in ways)) for at, of, ways in found["sent"]]
-    events = len(recorded(found["flight"])[found["component"]])
-    play(found["flight"], found["component"], [s for s in sent if s.of < events], found["strict"], min(found["last"], events))
+    flight, name = found["flight"], found["component"]
+    inputs, events = inputs_of(flight, name), len(recorded(flight)[name])
+    sent = [Spoilt(at, min(inputs[method][1], key=lambda k: abs(k - of)), tuple(Way(tuple(path), kind, value) for path, kind, value in ways))
+            for at, method, of, ways in found["sent"]]
+    return play(flight, name, sent, found["strict"], min(found["last"], events))
 
 
 PLAYERS = [(flight, name) for flight, (_, names) in FLIGHTS.items() for name in names]
