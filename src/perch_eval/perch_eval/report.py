@@ -86,15 +86,19 @@ _UNIT = re.compile(rf"_({'|'.join(UNITS)})(?=_|$)")
 
 def _timeline(flight: Flight) -> list[tuple[float, str]]:
     rows = [(t, f"mission commands {Command(c.command).name.lower()}: {c.reason}") for t, c in flight.values("controller/command")]
+    started = set()
     for _, order in flight.values("trajectory"):
         kind = {0: "move", 1: "perch", 2: "landing", 3: "powerline perch with recovery"}[order.at_end]
-        rows.append((order.trajectory.start_time, f"trajectory {order.id} ({kind}) starts, {order.trajectory.duration:.2f} s"))
+        recovery = f", of which {order.trajectory.duration - order.recovery_start:.2f} s are recovery" if order.recovery_start > 0.0 else ""
+        verb = "is re-planned, what remains takes" if order.id in started else "starts, takes"
+        started.add(order.id)
+        rows.append((order.trajectory.start_time, f"trajectory {order.id} ({kind}) {verb} {order.trajectory.duration:.2f} s{recovery}"))
     last = None
     for t, status in flight.values("controller/status"):
         if status.message and status.message != last:
             rows.append((t, f"controller: {status.message}"))
             last = status.message
-    states = {0: "free", 1: "attached to", 2: "bounced off", 3: "collided with", 4: "on"}
+    states = {0: "leaves", 1: "attached to", 2: "bounced off", 3: "collided with", 4: "on"}
     for t, contact in flight.values("contact"):
         rows.append((t, f"contact (truth): {states[contact.state]} {contact.body}" + (f", {contact.reason}" if contact.reason else "")))
     return sorted(rows)
@@ -128,7 +132,7 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
     if error := report.get("target_error"):
         rows.append(("target error", f"{100 * error['position_m']:.1f} cm, {error['attitude_deg']:.2f} deg"))
     if contact := report.get("contact"):
-        rows.append(("contact", f"{contact['state']} at {contact['time']:.3f} s: {contact['normal_speed_m_s']:.2f} m/s normal, "
+        rows.append(("contact", f"{contact['state']} at {contact['time']:.3f} s: {contact['normal_speed_m_s']:z.2f} m/s normal, "
                                 f"{contact['tangential_speed_m_s']:.2f} m/s tangential, tilt error {contact['tilt_error_deg']:.1f} deg, "
                                 f"{100 * contact['offset_m']:.1f} cm from the perch point {contact['reason']}".rstrip()))
     if report["recording_damage"]:
