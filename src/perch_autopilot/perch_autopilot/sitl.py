@@ -18,7 +18,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from perch_core.arrays import Numbers
-from perch_sim.timing import CONTROL_PERIOD
 from perch_autopilot import firmware, msp
 from perch_autopilot.configuration import Cli, CliError, Configuration
 from perch_autopilot.firmware import FirmwareError
@@ -32,6 +31,7 @@ _START = 10.0                     # for the firmware to open its port [s]
 _ANSWER = 5.0                     # for motors after a state; a busy machine takes its time [s]
 _FOLDER = "perch-betaflight-"     # in which it finds its memory; removed when it has read it
 _ORPHAN = 600.0                   # age of a folder whose owner was killed before that [s]
+CYCLE = 0.002                     # between states that are sent [s]
 _EEPROM = "eeprom.bin"
 LEVEL = (1.0, 0.0, 0.0, 0.0)      # w x y z
 GRAVITY = (0.0, 0.0, 9.81)
@@ -122,7 +122,7 @@ class Sitl:
         Raises:
             Frozen: no answer.
         """
-        self.time += CONTROL_PERIOD
+        self.time += CYCLE
         running = self._firmware
         p, q, r = gyro
         x, y, z = force

@@ -17,7 +17,6 @@ from perch_core import so3
 from perch_core.camera_mount import CameraMount
 from perch_core.component import Component, Input, Output
 from perch_core.processes import frozen_heap
-from perch_sim.timing import CONTROL_PERIOD
 from perch_core.urdf import optical_frame
 from perch_core.values import CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState
 from perch_core.vehicle import load_vehicle
@@ -35,6 +34,7 @@ from perch_sim.lockstep import Task
 from perch_sim.lockstep.batches import Arrival
 from perch_sim.rendering import Renderer, Scene, build_scene
 from perch_sim.scenario import Scenario
+from perch_sim.timing import CONTROL_PERIOD
 
 STRIDE = 5        # samples between states of the estimator that are kept
 TRANSPORT = 0.02  # from the middle of an exposure to the arrival of its image [s]

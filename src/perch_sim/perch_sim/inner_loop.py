@@ -15,9 +15,9 @@ import numpy as np
 
 from perch_core.jit import compiled
 from perch_core.registry import resolved
-from perch_sim.timing import CONTROL_PERIOD
 from perch_core.vehicle import Vehicle
 from perch_sim.imu import ImuSample
+from perch_sim.timing import CONTROL_PERIOD
 
 FIRMWARE = "perch_autopilot.loop:FirmwareLoop"  # an optional extra, loaded where a vehicle names it
 

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.values import Contact
 from perch_core.vehicle import Vehicle
 from perch_sim import seeding
@@ -18,6 +17,7 @@ from perch_sim.dynamics import GRAVITY, STATES, Hold, advance_to_touch
 from perch_sim.obstacles import make_obstacles
 from perch_sim.scenario import Scenario
 from perch_sim.state_history import TrueState
+from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_sim.wind import WindField
 
 SUBSTEPS = 4        # Runge-Kutta steps per period: 0.5 ms each

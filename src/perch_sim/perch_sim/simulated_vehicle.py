@@ -12,7 +12,6 @@ import numpy as np
 from perch_core import so3
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
 from perch_core.errors import ConfigError, PerchError
-from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
     NANOSECONDS, AttitudeThrust, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RatesThrust, RotorState,
@@ -27,6 +26,7 @@ from perch_sim.parameters import CAMERAS, VehicleParameters
 from perch_sim.scenario import Scenario, load_scenario
 from perch_sim.simulation import Simulation
 from perch_sim.state_history import TrueState
+from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 
 SLOW_STEPS = 5                         # steps from one clock, rotor state or pose of a moving pad to the next: 100 Hz
 MOST_WAITING = 2                       # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones

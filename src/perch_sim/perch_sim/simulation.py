@@ -18,7 +18,6 @@ import numpy as np
 
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
-from perch_sim.timing import CONTROL_PERIOD_NS
 from perch_core.values import NANOSECONDS, Contact
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_sim import seeding
@@ -35,6 +34,7 @@ from perch_sim.plant import SUBSTEPS, Plant
 from perch_sim.rendering.sensor import control_exposure
 from perch_sim.scenario import Scenario
 from perch_sim.state_history import StateHistory, TrueState
+from perch_sim.timing import CONTROL_PERIOD_NS
 
 MEMORY = 60_000_000     # how far back an exposure may reach [ns]
 MOTOR_TIMEOUT = 100_000_000  # a motor controller stops without commands for so long [ns]

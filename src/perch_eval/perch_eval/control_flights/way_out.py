@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_sim.timing import CONTROL_PERIOD
 from perch_sim.plant import Plant
+from perch_sim.timing import CONTROL_PERIOD
 
 SWITCHES = (0.02, 0.04, 0.06, 0.09, 0.13)  # the second command may begin so long after the fault [s]
 HORIZON = 0.4                              # a vehicle that has broken nothing so long after the fault is one that may get away [s]

@@ -21,12 +21,12 @@ from typing import Any, NamedTuple, Protocol, cast
 
 from perch_core.component import Component
 from perch_core.errors import PerchError
-from perch_sim.timing import CONTROL_PERIOD_NS
 from perch_core.values import CameraImage
 from perch_sim.lockstep.batches import Arrival, Batch, Place, first_undrawn, is_drawn, is_lost
 from perch_sim.lockstep.packet import Codec, Packet
 from perch_sim.lockstep.participant import Emissions, Participant, handlers
 from perch_sim.lockstep.tasks import Task
+from perch_sim.timing import CONTROL_PERIOD_NS
 
 MOST_UNDRAWN = 2            # frames of a camera that have arrived before their images
 LONGEST_SILENCE = 500       # steps without a frame after which a participant gets what has come to it all the same

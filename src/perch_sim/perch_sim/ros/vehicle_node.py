@@ -12,12 +12,12 @@ from perch_core.ros import topics
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import SHARED
 from perch_core.ros.wiring import Publication, Wiring, foreign_writers
-from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from perch_core.values import CameraImage
 from perch_sim.lockstep import BEGUN, Schedule, flight_tasks
 from perch_sim.lockstep.link import Door, Waiting, address
 from perch_sim.pacing import Pacing
 from perch_sim.ros.remote import RemoteParticipant
+from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from rclpy.clock import Clock, ClockType
 
 LOOK = 0.05         # between looks at who is silent [s]
