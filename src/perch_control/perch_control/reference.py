@@ -213,7 +213,7 @@ def _sampled_setpoints(at, p, v, q, w, dw, specific, times, out):
         t = times[m]
         over = max(t - end, 0.0)
         k, u = _place(at, t)
-        f, rate, turning, acceleration = (1.0 - u) * specific[k] + u * specific[k + 1], 0.0, _ZERO, _ZERO
+        f, rate, turning, acceleration = _specific_at(at, specific, t), 0.0, _ZERO, _ZERO
         if over == 0.0:
             turning, acceleration = _between(w, k, u), _between(dw, k, u)
             before, after = max(t - half, 0.0), min(t + half, end)
