@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,40 @@ def test_figures_say_of_which_code_they_are(data):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(RESULTS)))
 def test_a_page_of_other_code_says_so(page):
     assert not revision.out_of_date(page.read_text(), NOW), "python3 -m perch_eval.revision"
+
+
+def _bare(source: bytes) -> str:
+    """The syntax of a module without expressions that are constants: docstrings, and the dots that take their place."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(body := getattr(node, "body", None), list):
+            node.body = [one for one in body if not (isinstance(one, ast.Expr) and isinstance(one.value, ast.Constant))]  # type: ignore[attr-defined]
+    return ast.dump(tree)
+
+
+@pytest.mark.parametrize("package", sorted((RESULTS.parents[1] / "src").glob("*/setup.py")), ids=lambda file: file.parent.name)
+def test_without_docstrings_the_code_is_the_same(package):
+    for file in package.parent.rglob("*.py"):
+        source = file.read_bytes()
+        assert _bare(revision.without_docstrings(source)) == _bare(source), file
+
+
+def test_words_do_not_change_the_digest_and_figures_do(tmp_path, monkeypatch):
+    file, git = tmp_path / "src" / "rate.py", ["git", "-C", str(tmp_path)]
+    file.parent.mkdir()
+
+    def written(text: str) -> str:
+        file.write_text(text)
+        return revision.digest()
+
+    monkeypatch.setattr(revision, "root", lambda: tmp_path)
+    subprocess.run([*git, "init", "-q"], check=True)
+    file.touch()
+    subprocess.run([*git, "add", "src"], check=True)
+    first = written('"""Rates."""\n\nRATE = 500\n"""[Hz]"""\n\n\ndef f():\n    """Says "hello"."""\n')
+    assert first == written('"""All rates\n\nof it."""\n\nRATE = 500\n"""Hertz"""\n\n\ndef f():\n    """Greets."""\n')
+    assert first != written('"""Rates."""\n\nRATE = 400\n"""[Hz]"""\n\n\ndef f():\n    """Says "hello"."""\n')
+    assert first != written('"""Rates."""\n\nRATE = """[Hz]"""\n\n\ndef f():\n    """Says "hello"."""\n')
 
 
 def test_a_page_is_marked_once_the_code_has_changed(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Which code a result is of: commit, and a digest of all sources, configuration and pinned libraries.
+"""Which code a result is of: commit, and a digest of all sources without their docstrings, configuration and pinned libraries.
 
     python3 -m perch_eval.revision [PAGE...]      mark the pages of results that are of other code
 """
@@ -17,6 +17,7 @@ from perch_core.config import config_dir
 CODE = ("src", "config", "requirements")
 OLDER = ", older than the code"
 _DIGEST = re.compile(r"\(digest ([0-9a-f]{12})\)")
+_DOCSTRING = re.compile(rb'^([ \t]*)"""(?![),])(?:[^"\\]|\\.|"(?!""))*"""[ \t]*$', re.MULTILINE | re.DOTALL)
 
 
 def root() -> Path:
@@ -34,13 +35,22 @@ def commit() -> str:
     return found + "+" * bool(_git("status", "--porcelain", "--untracked-files=no", *CODE)) if found else "unknown"
 
 
+def without_docstrings(source: bytes) -> bytes:
+    """Python source whose docstrings, of modules, classes, functions and attributes, are empty: what is left decides what it computes."""
+    return _DOCSTRING.sub(rb"\1...", source)
+
+
 def digest() -> str:
-    """SHA-256 over all files of `CODE` that git tracks, as they are in the working tree, 12 digits; empty outside a repository."""
+    """SHA-256 over all files of `CODE` that git tracks, as they are in the working tree, 12 digits; empty outside a repository.
+
+    Docstrings do not count: who improves their words need not fly again.
+    """
     total = hashlib.sha256()
     names = _git("ls-files", *CODE).splitlines()
     for name in names:
         path = root() / name
-        total.update(name.encode() + b"\0" + (path.read_bytes() if path.is_file() else b"") + b"\0")
+        content = path.read_bytes() if path.is_file() else b""
+        total.update(name.encode() + b"\0" + (without_docstrings(content) if path.suffix == ".py" else content) + b"\0")
     return total.hexdigest()[:12] if names else ""
 
 
