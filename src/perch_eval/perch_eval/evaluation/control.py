@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -22,6 +23,7 @@ WORST = 0.05                         # RMSE of each axis of a perch [m]
 CUT = 0.6                            # share of the RMSE that L1 takes away
 LOADED = "wind 5 m/s, mass +20 %"
 NO_WAY = "no way out"
+GOOD = ("held", "perched")
 ENDINGS = ("hovering", "landed", "perched", "crashed", "lost")
 
 
@@ -29,10 +31,9 @@ def fault_sections(effort: Effort) -> list[Section]:
     """Every fault at random moments; writes `faults_in_flight.md` and its JSON."""
     jobs = [(fault.name, seed) for fault in FAULTS for seed in range(1, MOMENTS + 1)]
     flown = computed(effort, "faults", jobs, _faulted, lambda r: r["end"] in END_STATES)
-    out = Section("c_faults", "Faults in flight",
-                  f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
-                  "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth. "
-                  "Every flight: faults_in_flight.md.")
+    about = (f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
+             "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth.")
+    out = Section("c_faults", "Faults in flight", f"{about} Flights without a good end: faults_in_flight.md.")
     rows = []
     for fault in FAULTS:
         own = [r for r in flown if r["fault"] == fault.name]
@@ -42,7 +43,7 @@ def fault_sections(effort: Effort) -> list[Section]:
         rows.append((f"{fault.name}: {fault.about}", *(ends[e] for e in ENDINGS), without, touched))
         out.claim(fault.name, f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]) + f"; {without} {NO_WAY}" * bool(without),
                   "", safe + without == len(own) if own else None, "every flight ends hovering, landed or perched, or had no way out")
-    text = ["# Faults in flight", "", out.about, "",
+    text = ["# Faults in flight", "", f"{about} Every flight: faults_in_flight.json.", "",
             "*crashed*: broken by an impact, or a rotor touched the floor; *lost*: none of the others after 25 s; *touched the wall*: rotors touched "
             f"it on the way, and nothing broke; *{NO_WAY}*: from the true state in which the fault left the vehicle, without any delay, rotors at their "
             "limits in any combination, changed to any other once, were tried on the plant, and all of them broke it.", "",
@@ -57,19 +58,21 @@ def comparison_sections(effort: Effort) -> list[Section]:
     """All controllers on the same flights; writes `comparison.md` and `comparison.json`."""
     seeds = range(1, 1 + (FULL_SEEDS if effort.full else QUICK_SEEDS))
     jobs = [(c, k, m, seed) for seed in seeds for m in MANEUVERS for k in CONDITIONS for c in CONTROLLERS]
-    flown = computed(effort, "comparison", jobs, _compared, lambda r: r["outcome"] in ("held", "perched"))
+    flown = computed(effort, "comparison", jobs, _compared, lambda r: r["outcome"] in GOOD)
     runs = {key: [r for r in flown if (r["controller"], r["condition"], r["maneuver"]) == key] for key in product(CONTROLLERS, CONDITIONS, MANEUVERS)}
     offset = ", ".join(f"{x:g}" for x in LINE)
-    out = Section("c_comparison", "Controllers compared on the same flights",
-                  f"{'Seed 1' if len(seeds) == 1 else f'Seeds 1 to {len(seeds)}'}; true position against the reference "
-                  "(line: as commanded; perch: the plan), RMS per axis x, y, z; "
-                  f"the state is estimated (VIO model, UKF). Line: ({offset}) m in {LINE_TIME:g} s and 0.5 s of hover. Perch: 90 deg, 1.7 m, to the contact. "
-                  "Wind 5 m/s blows at 45 deg to the wall. With L1 the controller measures thrust / mass in hover and flies the perch with it. "
-                  "Every flight: comparison.md.")
-    text = ["# Controllers compared", "", out.about]
+    about = (f"{'Seed 1' if len(seeds) == 1 else f'Seeds 1 to {len(seeds)}'}; true position against the reference "
+             "(line: as commanded; perch: the plan), RMS per axis x, y, z; "
+             f"the state is estimated (VIO model, UKF). Line: ({offset}) m in {LINE_TIME:g} s and 0.5 s of hover. Perch: 90 deg, 1.7 m, to the contact. "
+             "Wind 5 m/s blows at 45 deg to the wall. With L1 the controller measures thrust / mass in hover and flies the perch with it.")
+    out = Section("c_comparison", "Controllers compared on the same flights", f"{about} All conditions: comparison.md.")
+    text = ["# Controllers compared", "", f"{about} Every flight: comparison.json."]
     for maneuver in MANEUVERS:
-        text += ["", f"## {maneuver.capitalize()}", "", "RMSE x, y, z [cm]; outcome, per seed where they differ.", "",
+        text += ["", f"## {maneuver.capitalize()}", "", "RMSE x, y, z [cm]; outcomes.", "",
                  *table("| " + " | ".join(CONTROLLERS), ((k, *(_cell(runs[c, k, maneuver]) for c in CONTROLLERS)) for k in CONDITIONS))]
+    failed = [f"* {m}, {k}, **{c}**: " + "; ".join(f"seed {r['seed']} {r['outcome']}" for r in bad) for m, k, c in product(MANEUVERS, CONDITIONS, CONTROLLERS)
+              if (bad := [r for r in runs[c, k, m] if r["outcome"] not in GOOD])]
+    text += ["", "## Flights without a good end", "", *(failed or ["None."])]
     for c in CONTROLLERS:  # what is given up early has a small error: every flight must come to its good end
         own = runs[c, "nominal", "perch"]
         worst = float(_rms(own).max())
@@ -116,9 +119,9 @@ def _rms(own: Sequence[dict[str, Any]]) -> np.ndarray:
 
 
 def _cell(own: Sequence[dict[str, Any]]) -> str:
-    rmse = 100 * _rms(own)
-    outcomes = [r["outcome"] for r in own]
-    return ", ".join(f"{x:.1f}" for x in rmse) + "; " + (outcomes[0] if len(set(outcomes)) == 1 else " / ".join(outcomes))
+    """RMSE per axis [cm], and how many flights came to which end."""
+    ends = Counter(re.split("[:,]", r["outcome"])[0] for r in own)
+    return ", ".join(f"{x:.1f}" for x in 100 * _rms(own)) + "; " + (", ".join(f"{n} {end}" for end, n in ends.most_common()) if len(ends) > 1 else [*ends][0])
 
 
 def _faulted(job: tuple[str, int]) -> dict[str, Any]:
