@@ -1,9 +1,9 @@
-"""The watchdog and the pilot's takeover on Betaflight's own firmware, in simulated time: commands stop in each phase of a perch.
+"""Watchdog and pilot's takeover on Betaflight's own firmware, in simulated time: commands stop in each phase of a perch.
 
-A perch on `surface_90` (modelled VIO and tags) through the firmware; the commands go to the process that holds the link (`LinkSupervisor`), from
-it over MSP to the firmware, whose self-level mode levels the simulated body. They stop for 50 ms to 5 s, or for good: the node is killed,
-or hangs. A body that turns in free air, where no wall ends it, is found tilted and turning instead. Times count from the last command that
-has reached the supervisor. Needs the firmware (`python3 scripts/betaflight.py build`).
+A perch on `surface_90` (modelled VIO and tags) is flown through the firmware. Commands go to the process that holds the link
+(`LinkSupervisor`) and from there over MSP to the firmware, whose self-level mode levels the simulated body. They stop for 50 ms
+to 5 s, or for good: the node is killed or hangs. In further runs, a body in free air, without a wall, starts tilted and rotating.
+Times are relative to the last command that reached the supervisor. Requires the firmware (`python3 scripts/betaflight.py build`).
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ SCENARIO = replace(load_scenario("surface_90"), vehicle="betaflight")
 LEVEL = 10.0                              # tilt that counts as level [deg]
 PHASES = {"take-off": ("take_off", 0.6), "hover": ("searching", 0.3), "way to the wall": ("tracking", 0.5),
           "turn begins": ("contact", -0.35), "turn": ("contact", -0.25), "turn, late": ("contact", -0.15), "perched": ("perched", 0.3)}
-"""Name -> after the beginning of which phase of the mission [s]; `contact`: before the first touch."""
+"""Name -> phase of the mission, time after its beginning [s]; `contact`: time relative to the first touch."""
 GAPS = (0.05, 0.2, 0.5, 1.0, 5.0)         # commands stop for so long [s]; then they go on
 TILTED = ((30.0, 2.0), (60.0, 4.0), (90.0, 0.0), (85.0, 6.5))
-"""Tilt [deg] and rate [rad/s] of a body in free air at the last commands, which say that it shall turn on."""
+"""Tilt [deg] and rate [rad/s] of a body in free air at the last commands, which demand that rate."""
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.8, 0.0))
-"""About which it turns: roll, pitch, and between them."""
+"""Axes of its rotation: roll, pitch, and between them."""
 WATCHED = 6.0                             # after they have stopped [s]
 
 
 @dataclass(frozen=True)
 class Stop:
-    """What came of commands that stopped; times from the last command [s], nan: it did not happen before the next, or a touch.
+    """Result of stopped commands; times are from the last command [s], nan: not before the next command or a touch.
 
     Attributes:
         tilt: of the body at the last command [deg].
         most: largest tilt after it [deg].
-        told: the autopilot gets "level", or "off".
-        levelled: the body is level, and stays so.
-        down: it is told to descend, or motors are off.
-        held: the last command was sent for so long.
+        told: time until the autopilot is commanded to level, or off.
+        levelled: time until the body is level, and stays level.
+        down: time until a descent is commanded, or motors are off.
+        held: time for which the last command was still sent.
     """
 
     tilt: float
@@ -58,7 +58,7 @@ class Stop:
 
 
 def begun() -> tuple[Loop, SupervisedLoop, list[float]]:
-    """A flight before its first step, with the goal sent; and the times of its touches, as they come [s]."""
+    """Return a flight before its first step, with its goal sent, its autopilot, and the growing list of times of touches [s]."""
     loop, touched = arrange(SCENARIO, 1), []
     simulation = loop.vehicle.simulation
     simulation.loop.close()
@@ -69,7 +69,7 @@ def begun() -> tuple[Loop, SupervisedLoop, list[float]]:
 
 
 def moments() -> dict[str, float]:
-    """When each of `PHASES` is in the undisturbed flight [s]."""
+    """Return the times of `PHASES` in the undisturbed flight [s]."""
     loop, _, touched = begun()
     with closing(loop):
         while not any(phase == "perched" for _, phase, _ in loop.trace.phases):
@@ -83,9 +83,9 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
     """Fly, and stop the commands.
 
     Args:
-        at: from this time on [s].
-        gap: for so long [s]; None: for good.
-        kill: the node is killed; else it says nothing.
+        at: start of the gap [s].
+        gap: its duration [s]; None: for good.
+        kill: the node is killed; otherwise it sends nothing.
     """
     loop, kept, touched = begun()
     with closing(loop):
@@ -113,7 +113,7 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
 
 
 def levelled(vehicle: str, axis: tuple[float, float, float], tilt: float, rate: float) -> float:
-    """When a body in free air that is tilted and turns about an axis in B is level after the last command [s]."""
+    """Return the time from the last command until a body in free air, tilted and rotating about an axis in B, is level [s]."""
     body = Body(load_vehicle(vehicle))
     with closing(body.loop):
         body.hover()
@@ -126,7 +126,7 @@ def levelled(vehicle: str, axis: tuple[float, float, float], tilt: float, rate: 
 
 
 def held_without_link() -> float:
-    """How long the firmware goes on turning the body as it was told last, from when the link is cut, at most 1.5 s [s]."""
+    """Return how long after the link is cut the firmware holds the last commanded rate, at most 1.5 s [s]."""
     body = Body(load_vehicle(SCENARIO.vehicle))
     with closing(body.loop):
         body.hover()
@@ -138,7 +138,7 @@ def held_without_link() -> float:
 
 
 def taken_over(at: float) -> float:
-    """From the pilot's switch to the first cycle in which the motors stand, as his arming switch is off [s]."""
+    """Return the time from the pilot's takeover, with the arming switch off, to the first cycle with motors stopped [s]."""
     loop, kept, _ = begun()
     with closing(loop):
         while loop.time < at:
@@ -152,7 +152,7 @@ def taken_over(at: float) -> float:
 
 
 def figures(quick: bool) -> list[Figure]:
-    """Every phase with every gap; quick: commands stop for good only."""
+    """Measure every phase with every gap; `quick`: only with the node killed."""
     found, out = {}, []
     print(f"{'phase':16s} {'stop':>8s} {'tilt':>5s} {'most':>5s} {'told':>6s} {'level':>6s} {'down':>6s} {'held':>6s}   [deg], [s]")
     for name, at in (when := moments()).items():

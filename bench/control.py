@@ -1,7 +1,7 @@
 """Speed of the control laws: times of their steps.
 
-They fly on the plant of the tests (`tests/closed_loop`). A step's time is the processor time of its thread: a busy machine stretches
-the clock, which is given beside it. Deadlines in real time: `bench.py ros`. How the laws fly: `evaluate.py --only c_comparison`.
+They fly on the plant of the tests (`tests/closed_loop`). A step's time is the processor time of its thread; wall-clock time,
+which depends on other load, is given beside it. Real-time deadlines: `bench.py ros`. Flights: `evaluate.py --only c_comparison`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _nmpc(thrust_states: bool = False, lines: bool = False) -> NmpcController:
 
 
 def _timed(law) -> tuple[list[float], list[float]]:
-    """The law's own time per step in flight, processor and clock [s]; filled while it flies."""
+    """Return lists of the law's time per step, processor and wall clock [s], which are filled in flight."""
     used: list[float] = []
     passed: list[float] = []
     control = law.control

@@ -1,4 +1,4 @@
-"""What every bench group shares: figures, their bars, and how they are measured.
+"""Common parts of the bench groups: figures, their bars, and time measurement.
 
     # bench/<group>.py, run by `python3 scripts/bench.py <group>`
     from harness import Figure, figure, measure
@@ -39,7 +39,7 @@ class Figure:
         median: median of the samples.
         p99: 99th percentile of the samples.
         n: number of samples.
-        bar: the value to keep, None: reported only.
+        bar: the value to keep; None: reported only.
         comparison: statistic and relation that make the bar, e.g. "median <=", "p99 <=", "min >=", "max ==".
         holds: whether the bar holds; None without a bar.
     """
@@ -56,7 +56,7 @@ class Figure:
 
 def figure(name: str, unit: str, samples: Sequence[float] | np.ndarray, bar: float | None = None,
            comparison: str = "median <=") -> Figure:
-    """A figure from its samples, with the bar judged.
+    """Return a figure from its samples, with the bar evaluated.
 
     Raises:
         ValueError: no samples, or a comparison that is not `<median|p99|max|min> <<=|>=|==>`.
@@ -76,7 +76,7 @@ def figure(name: str, unit: str, samples: Sequence[float] | np.ndarray, bar: flo
 def measure(call: Callable[[], object], repetitions: int = 200, warm_up: int = 3) -> np.ndarray:
     """Wall-clock time of each of `repetitions` calls [s], after `warm_up` calls that do not count.
 
-    The garbage collector is off while it measures, as its pauses belong to no single call.
+    The garbage collector is off meanwhile, as its pauses belong to no single call.
     """
     for _ in range(warm_up):
         call()
@@ -90,7 +90,7 @@ def measure(call: Callable[[], object], repetitions: int = 200, warm_up: int = 3
 
 
 def machine() -> dict[str, object]:
-    """What the figures were measured on."""
+    """Return a description of this machine."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
@@ -101,13 +101,13 @@ def machine() -> dict[str, object]:
 
 
 def as_json(group_figures: dict[str, list[Figure]]) -> dict[str, object]:
-    """The one form in which every figure is written."""
+    """Return the figures in their common JSON form."""
     return {**made_of(), "machine": machine(),
             "figures": [{"group": group, **asdict(item)} for group, items in group_figures.items() for item in items]}
 
 
 def table(items: list[Figure]) -> str:
-    """The figures of a group for people."""
+    """Return the figures of a group as a text table."""
     rows = [("figure", "median", "p99", "n", "unit", "bar", "")]
     for item in items:
         bar = "" if item.bar is None else f"{item.comparison} {item.bar:g}"

@@ -1,4 +1,4 @@
-"""What the machine itself does to a program that has to be on time."""
+"""Effects of the machine itself on the timing of real-time programs."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _spawn = multiprocessing.get_context("spawn")
 
 @contextmanager
 def awake() -> Iterator[None]:
-    """Keep the cores from falling asleep, by work that yields to everything else.
+    """Keep the cores from sleeping, by work that yields to everything else.
 
-    A sleeping core of a virtual machine has been given away by its host and is back after milliseconds; on real machines for
-    real time idle=poll or the governor does this. Not all of the time: a host that grants so many cores' time in each 100 ms takes
-    them away for the rest of it, for up to 10 ms, once all are busy throughout (docs/real_time.md).
+    A sleeping core of a virtual machine is given away by its host and returns only after milliseconds; on physical real-time
+    machines, idle=poll or the governor prevents this. The work has pauses: if all cores are busy throughout, a host with a quota
+    per 100 ms withdraws them for the rest of the period, for up to 10 ms (docs/real_time.md).
     """
     processes = [_start(_spin, os.getpid()) for _ in range(os.cpu_count() or 1)]
     try:
@@ -37,9 +37,8 @@ def awake() -> Iterator[None]:
 
 
 class LateWakeUps:
-    """Counts how often a program that does nothing but wake once per control period, before everyone else, is late by more
-    than a period: what no node can be better than. Linux, with permission for real-time scheduling; otherwise it runs as any
-    other."""
+    """Counts late wake-ups, by more than a period, of a program that only wakes once per control period at a priority above the
+    nodes: a lower bound for every node. Linux, with permission for real-time scheduling; otherwise at normal priority."""
 
     def __init__(self) -> None:
         self._pipe, theirs = _spawn.Pipe()
@@ -54,8 +53,8 @@ class LateWakeUps:
 
 
 def late_with_load(load: float, seconds: float) -> float:
-    """Percentage of periods in which a loop that computes for as long as another program did, and does nothing else, is late by more
-    than a period: what the machine makes of that load.
+    """Return the percentage of periods in which a loop that only computes for a given time per period is late by more than a
+    period, which is due to the machine alone.
 
     Args:
         load: processor time per period [s].
@@ -69,8 +68,8 @@ def late_with_load(load: float, seconds: float) -> float:
 
 
 class Stolen:
-    """Processor time that the host of a virtual machine gives to others while a program here wants it, since the start; in ticks of
-    10 ms, and only as far as the host tells. Linux."""
+    """Stolen time: processor time since the start that the host of a virtual machine gave to others while a program here was
+    runnable; in ticks of 10 ms, as far as the host reports it. Linux."""
 
     def __init__(self, stat: Path = Path("/proc/stat")) -> None:
         self._stat = stat
@@ -82,7 +81,7 @@ class Stolen:
         return 100.0 * (self._total() - before) / ((time.monotonic() - begin) * (os.cpu_count() or 1))
 
     def _total(self) -> float:
-        """Of all cores [s]: the eighth of the first line's times."""
+        """Return the stolen time of all cores [s]: the eighth value of the first line."""
         return int(self._stat.read_text().split(maxsplit=9)[8]) / os.sysconf("SC_CLK_TCK")
 
 
@@ -93,7 +92,7 @@ def _start(work, *arguments) -> BaseProcess:
 
 
 def _schedule(policy: str, priority: int) -> None:
-    """Schedule this process so, where Linux permits it."""
+    """Set the scheduling of this process, if Linux permits it."""
     with suppress(OSError, AttributeError):
         os.sched_setscheduler(0, getattr(os, policy), os.sched_param(priority))
 

@@ -19,7 +19,7 @@ REACH = 1.5  # of the bar: around the point in front of the vehicle [m]
 
 
 def figures(quick: bool) -> list[Figure]:
-    """0.8 m of motion before three sagging wires, with the estimator's errors as VIO has them."""
+    """Measure mapping in 0.8 m of motion in front of three sagging wires, with typical errors of the estimator."""
     cv2.setNumThreads(1)
     mount = load_vehicle("rpg").mounts["front"]
     cables = [Catenary.from_sag(np.array(a), np.array(b), 0.1) for a, b in CABLES]
@@ -42,7 +42,7 @@ def figures(quick: bool) -> list[Figure]:
 
 
 def _fly(renderer, rng, detection, mapping):
-    """The map after 16 images at 10 Hz."""
+    """Return the mapped lines after 16 images at 10 Hz."""
     mapper, result = LineMapper(), None
     drift, turn = rng.normal(0, 0.005, 3), so3.exp(np.radians(0.2) * rng.standard_normal(3))
     for k, share in enumerate(np.linspace(0.0, 1.0, 16)):

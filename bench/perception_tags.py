@@ -23,7 +23,7 @@ PLACES = (("surface_60", "60 deg, 1.7 m", 0.5, 0.3), ("surface_90", "90 deg, 1.7
 
 
 def figures(quick: bool) -> list[Figure]:
-    """One hover after another before each pad: search, then tracking, each frame timed and compared with the truth."""
+    """Measure hovers in front of each pad: search, then tracking, with each frame timed and compared with the truth."""
     cv2.setNumThreads(1)
     hovers, frames = (5, 4) if quick else (42, 6)
     out: list[Figure] = []
@@ -48,7 +48,7 @@ def figures(quick: bool) -> list[Figure]:
 
 
 def _beside_pupil(hovers: int, search: Callable[[np.ndarray], list]) -> list[Figure]:
-    """Corners in the same images by us and by pupil-apriltags (`pip install pupil-apriltags`), which knows no lens."""
+    """Compare our corners with those of pupil-apriltags (`pip install pupil-apriltags`, no lens model) in the same images."""
     out = []
     for scenario_name, name, _, _ in PLACES:
         scenario = load_scenario(scenario_name)
@@ -72,7 +72,7 @@ def _beside_pupil(hovers: int, search: Callable[[np.ndarray], list]) -> list[Fig
 
 
 def _sightings(scenario_name, hovers, frames, acquired):
-    """Errors (position [m], attitude [rad]) or None, whether it was a search, and the time taken, frame by frame."""
+    """Yield per frame the errors (position [m], attitude [rad]) or None, whether it was a search, and the time taken [s]."""
     scenario = load_scenario(scenario_name)
     mount = load_vehicle(scenario.vehicle).mounts["front"]
     renderer = Renderer(build_scene(scenario, seed=5), mount, seed=5)

@@ -24,7 +24,7 @@ LATENCY = 0.040  # [s]
 
 
 def figures(quick: bool) -> list[Figure]:
-    """VIO per frame, UKF per step and update; RMSE through the perch, its cost in latency."""
+    """Measure times of VIO frames, UKF steps and updates, and the RMSE through the perch with and without latency."""
     ukf = _ukf(quick)  # by the wall clock: before the flights, which use every core
     tasks = [(scenario, seed) for scenario in (*dict(SCENARIOS), IDEAL) for seed in range(1 if quick else 20)]
     flown: dict[str, list[_Flown]] = {scenario: [] for scenario, _ in tasks}
@@ -52,7 +52,7 @@ class _Flown:
 
 
 def _fly(task: tuple[str, int]) -> _Flown:
-    """One rendered perch through VIO and UKF."""
+    """Run VIO and UKF on one rendered perch."""
     cv2.setNumThreads(1)
     scenario = load_scenario(task[0])
     flight, begin = estimation_flight.fly(scenario, task[1]), estimation_flight.motion_of(scenario, task[1]).perch_time
@@ -68,7 +68,7 @@ def _rmse(track: estimation_flight.EstimatorTrack, begin: float) -> np.ndarray:
 
 
 def _ukf(quick: bool) -> list[Figure]:
-    """One IMU step, and one VIO update with the replay of 40 ms: with VIO's whole state, as in flight, and with a pose alone."""
+    """Time an IMU step, and a VIO update with 40 ms of replay: with VIO's whole state, as in flight, and with a pose only."""
     imu, motion = load_vehicle("snapdragon").imu, PerchMotion()
     truth = motion.sample(np.arange(0.0, motion.duration - 0.003, 0.002))
     readings = read_imu(truth, imu, np.random.default_rng(1))

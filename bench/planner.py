@@ -42,7 +42,7 @@ print(imported, time.perf_counter() - begin)
 
 
 def _plan_times(waypoints: int, settings: PerchSettings, count: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Wall-clock and CPU time of one plan for each of `count` random problems [ms], and how many were refused."""
+    """Return wall-clock and CPU time of one plan for each of `count` random problems [ms], and the number of refusals."""
     vehicle, times, refused = load_vehicle("snapdragon"), [], 0
     for seed in range(count):
         problem = paper_like_problem(np.random.default_rng(seed), waypoints)
@@ -59,7 +59,7 @@ def _plan_times(waypoints: int, settings: PerchSettings, count: int) -> tuple[np
 
 
 def _additions() -> float:
-    """CPU time of a plain loop [s]: what this machine is worth at this moment."""
+    """Return the CPU time of a plain loop [s], a measure of the machine's present speed."""
     begin, total = time.process_time(), 0
     for k in range(10_000_000):
         total += k
@@ -67,7 +67,7 @@ def _additions() -> float:
 
 
 def _first_plan(fresh: bool) -> tuple[float, float]:
-    """Import time and time of the first plan of a new process [s]; fresh: without cached kernels."""
+    """Return import time and time of the first plan of a new process [s]; `fresh`: without cached kernels."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, **({"NUMBA_CACHE_DIR": folder} if fresh else {})}
         out = subprocess.run([sys.executable, "-c", _FIRST_PLAN], env=environment, capture_output=True, text=True, check=True)
@@ -76,7 +76,7 @@ def _first_plan(fresh: bool) -> tuple[float, float]:
 
 
 def _wrong(first: int) -> int:
-    """Wrong verdicts of `_CHUNK` random polynomials with margins from 1e-2 down to 1e-9, against Sturm's chain in exact rational arithmetic."""
+    """Count wrong verdicts on `_CHUNK` polynomials with margins from 1e-2 to 1e-9, by Sturm's chain in exact arithmetic."""
     wrong = 0
     for seed in range(first, first + _CHUNK):
         rng = np.random.default_rng(seed)
@@ -91,19 +91,19 @@ def _wrong(first: int) -> int:
 
 
 def _wrong_verdicts(count: int) -> float:
-    """Verdicts on `count` polynomials, a multiple of 100, that the exact chain contradicts; on all processors but one."""
+    """Count verdicts on `count` polynomials, a multiple of 100, that the exact chain contradicts; on all processors but one."""
     starts = range(0, count, _CHUNK)
     found = in_processes(_wrong, starts, max(1, (os.cpu_count() or 1) - 1))
     return float(sum(wrong for _, wrong in counted(found, len(starts), lambda one: not one[1], what=f"times {_CHUNK} verdicts")))
 
 
 def _say(what: str) -> None:
-    """Name what is measured next."""
+    """Print what is measured next."""
     print(f"  {what} ...", file=sys.stderr, flush=True)
 
 
 def figures(quick: bool) -> list[Figure]:
-    """Measure the group; what counts by the clock first, and alone."""
+    """Measure the group; wall-clock times come first, without work in parallel."""
     count = 60 if quick else 400
     out, shipped = [], shipped_settings()
     _say(f"plans of {count} problems")

@@ -33,7 +33,7 @@ from perch_planner.verifier import verify
 
 
 def confirmed(problem, refusal: PerchRefusal, settings: PerchSettings, vehicle) -> bool:
-    """Whether there is a plan with what the refusal names; what was refused before a program was solved is beyond all plans."""
+    """Return whether planning succeeds with the values that the refusal names, or it was refused before solving any program."""
     if not refusal.relaxed:
         return refusal.iterations == 0
     try:

@@ -16,7 +16,7 @@ def shipped_settings() -> PerchSettings:
 
 
 def random_problem(rng: np.random.Generator) -> PerchProblem:
-    """A problem: any inclination and heading, 1-5 m away, a start in motion, 0-10 waypoints (a quarter has a moving pad).
+    """Draw a problem: any inclination and heading, 1-5 m away, start in motion, 0-10 waypoints or, at times, a moving pad.
 
     Args:
         rng: source of randomness.

@@ -1,8 +1,8 @@
-"""VIO on images rendered along flights that racing pilots have flown; part of `python3 bench/recordings.py`.
+"""VIO on images rendered along recorded flights of racing pilots; part of `python3 bench/recordings.py`.
 
-The motion is that of UZH-FPV's ground truth, the camera, its calibration errors and the IMU are the simulator's. Before the take-off
-the truth jitters by some millimetres while the drone stands: there it is replaced by its mean. The floor is a metre below that place:
-a pilot's take-off shows a camera 4 cm above the floor nothing that it can follow.
+The motion is UZH-FPV's ground truth; camera, calibration errors and IMU are the simulator's. Before take-off, where the truth
+jitters by some millimetres while the drone stands, it is replaced by its mean. The floor is a metre below that place, as a camera
+4 cm above the floor has no features to track during a pilot's take-off.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ BESIDE = 3.0     # from the path to the walls [m]
 
 
 class RealMotion:
-    """A recorded motion from a standstill on, which lies `ABOVE` the origin, level and heading along x.
+    """A recorded motion that starts at rest, `ABOVE` the origin, level and heading along x.
 
     Attributes:
-        duration: of what is flown of it [s].
+        duration: of the part that is used [s].
         low, high: corners of the box around it [m], shape (3,).
     """
 
@@ -58,13 +58,13 @@ class RealMotion:
         self.low, self.high = points.min(axis=0), points.max(axis=0)
 
     def sample(self, times: np.ndarray) -> Motion:
-        """The state at times [s], shape (n,)."""
+        """Return the states at times [s], shape (n,)."""
         R, a = self._turn(times).as_matrix(), self._path(times, 2)
         return Motion(times, self._path(times), self._path(times, 1), R, self._turn(times, 1), np.einsum("nji,nj->ni", R, a + (0.0, 0.0, GRAVITY)))
 
 
 def flown(folder: Path) -> dict[str, Any]:
-    """All flights with all seeds: final errors as shares of the path, mean NEES of the position over 3, frames that were lost."""
+    """Run all flights with all seeds; return final errors as shares of the path, mean position NEES over 3, lost frames."""
     jobs = [(folder / f"{name}_snapdragon_with_gt.txt", duration, seed) for (name, duration), seed in product(FLIGHTS.items(), SEEDS)]
     found = dict(counted(in_processes(fly, jobs), len(jobs), what="flights"))
     rows = [[found[job] for job in jobs if job[0].name.startswith(f"{name}_")] for name in FLIGHTS]
@@ -74,7 +74,7 @@ def flown(folder: Path) -> dict[str, Any]:
 
 
 def fly(job: tuple[Path, float, int]) -> dict[str, float]:
-    """One flight with a seed's textures, calibration errors and noise; place and heading of the start are known to 1 mm and 1 mrad."""
+    """Run one flight with a seed's textures, calibration errors, noise; start position and heading are known to 1 mm, 1 mrad."""
     cv2.setNumThreads(1)
     file, duration, seed = job
     motion, scenario = RealMotion(file, duration), load_scenario("surface_90")

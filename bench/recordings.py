@@ -29,11 +29,11 @@ from recordings_scores import Figures
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording: its title, what it is, whose, and how it is scored.
+    """A recording: title, description, source, licence and scoring.
 
     Attributes:
-        paths: repository and path in it, `owner/name/path`; what is scored, and a truth from elsewhere.
-        score: takes the paths, and the folder of the page where there are none.
+        paths: repository and path in it, `owner/name/path`; the scored data, and a truth from another repository.
+        score: called with the paths or, if there are none, with tests/recordings and the folder of the page.
     """
 
     title: str
@@ -127,40 +127,40 @@ def motion(f: Figures) -> list[str]:
 
 
 def corners(f: Figures) -> str:
-    """Of NASA's tags."""
+    """Return the result on NASA's tags in words."""
     others = f"; {f['others']} more than the reference has" if f["others"] else ""
     return (f"{f['found']} of {f['reference']} found, corners {f['corner_px_median']:.2f} px median "
             f"({f['corner_px_p90']:.2f} px at 90 %){others}")
 
 
 def turns(f: Figures) -> str:
-    """Of the rotation series."""
+    """Return the result on the rotation series in words."""
     return (f"{f['poses']} poses; the turn against the photograph at 0 deg is wrong by {f['error_deg_mean']:.2f} deg in the mean, "
             f"{f['error_deg_max']:.1f} deg at most")
 
 
 def grid(f: Figures) -> str:
-    """Of the AprilGrid."""
+    """Return the result on the AprilGrid in words."""
     return (f"{', '.join(map(str, f['tags']))} of 36 tags (one photograph cuts the grid), {f['false']} false; on one lens to "
             f"{f['residual_px']:.2f} px")
 
 
 def poses(f: Figures) -> str:
-    """Of the clipboard."""
+    """Return the result on the clipboard in words."""
     return (f"position {f['position_percent_rms']:.2f} % rms of the distance, attitude {f['attitude_deg_rms']:.2f} deg rms, "
             f"NEES per dimension {f['nees_mean']:.1f} (median {f['nees_median']:.1f}), {f['poses']} of {f['boards']}; "
             f"residual of the reference {f['reference_px']:.2f} px")
 
 
 def board(f: Figures) -> str:
-    """Of the floor's four tags."""
+    """Return the result on the floor's four tags in words."""
     f = f["target"]
     return (f"{f['found']} of {f['images']} images, residual {f['reprojection_rms_px']:.2f} px; the board's place in the map scatters by "
             f"{100 * f['spread_m']:.1f} cm rms")
 
 
 def wires(f: Figures) -> str:
-    """Of photographs whose wires are traced."""
+    """Return the result on photographs with traced wires in words."""
     return (f"precision {f['precision']:.0f} %, recall {f['recall']:.0f} % (without any sixth of the photographs they change by at most "
             f"{f['precision_without_a_sixth']:.1f} and {f['recall_without_a_sixth']:.1f} percentage points)")
 
@@ -205,7 +205,7 @@ def page(results: Mapping[str, Figures], command: str) -> list[str]:
 
 
 def main() -> int:
-    """Score what is there and write the page."""
+    """Score the available recordings and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="with the repositories in FOLDER/owner/name")
     parser.add_argument("--only", choices=RECORDINGS, metavar="NAME",

@@ -1,4 +1,4 @@
-"""Perception on public recordings, each scored against what its repository says of it; part of `python3 bench/recordings.py`.
+"""Perception on public recordings, each scored against the reference of its repository; part of `python3 bench/recordings.py`.
 
 Every function takes the folder of a recording and returns figures for JSON: lengths in m, angles in deg, errors of corners in px.
 """
@@ -50,7 +50,7 @@ PAD = load_board("pad_four_tags")
 
 
 def flown(recording: Path, *options: str) -> tuple[Figures, str]:
-    """What `scripts/perceive.py` writes of a recording: `report.json`, without times and words, and `report.html`."""
+    """Run `scripts/perceive.py` on a recording; return its `report.json`, without times and text, and `report.html`."""
     with tempfile.TemporaryDirectory() as out:
         if command.main([str(recording), "--out", out, *options]):
             raise PerchError(f"{recording}: perceive.py failed")
@@ -60,12 +60,12 @@ def flown(recording: Path, *options: str) -> tuple[Figures, str]:
 
 
 def euroc(recording: Path, truth: Path) -> Figures:
-    """A EuRoC folder against a truth on file."""
+    """Score a EuRoC folder against a truth file."""
     return flown(recording, "--truth", str(truth))[0]
 
 
 def photographed_floor(tests: Path, out: Path) -> Figures:
-    """Nine seconds of `photo_flight`; its plots of path and error go to `out`."""
+    """Score nine seconds of `photo_flight`; write its plots of path and error to `out`."""
     sys.path.insert(0, str(tests))
     import photo_flight  # type: ignore[import-not-found]
 
@@ -89,7 +89,7 @@ def grey(path: Path) -> np.ndarray:
 
 
 def seen(path: Path, mount: CameraMount | None = None, board: TagBoard = PAD) -> Seen:
-    """What perceive.py sees in a photograph; without a mount its camera is not calibrated."""
+    """Return perceive.py's detections in a photograph; without a mount its camera counts as not calibrated."""
     image = picture(path, 0, "camera", None)
     mounted = mount or guessed_mount("camera", image.width, image.height)
     return look(image, mounted, board, LineDetectionConfig(appearance="plain"), mount is not None)
@@ -106,12 +106,12 @@ def pupil() -> Callable[..., list[Any]] | None:
 
 
 def ours_of(corners: np.ndarray) -> np.ndarray:
-    """AprilTag's corners (lb, rb, rt, lt), (4, 2), which it counts from the first pixel's corner, in our order and pixels."""
+    """Convert AprilTag's corners (lb, rb, rt, lt), (4, 2), with origin at the first pixel's corner, to our order and pixels."""
     return corners[[1, 0, 3, 2]] - 0.5
 
 
 def by_both(photographs: list[Path]) -> Iterator[tuple[str, list[Tags], int]]:
-    """Who, the tags in each photograph, and how many arcs of wires are found in all; pupil-apriltags looks for none."""
+    """Yield detector, tags in each photograph, and total number of wire arcs, which pupil-apriltags does not detect."""
     views = [seen(path) for path in photographs]
     yield "ours", [list(view.tags) for view in views], sum(len(view.wires) for view in views)
     if (search := pupil()) is not None:
@@ -120,7 +120,7 @@ def by_both(photographs: list[Path]) -> Iterator[tuple[str, list[Tags], int]]:
 
 
 def nasa(folder: Path) -> Figures:
-    """Photographs beside texts with a line for each tag, `number, (x y), (x y), (x y), (x y)`, as AprilTag detected it unrefined."""
+    """Score photographs that have text files with AprilTag's unrefined tags, `number, (x y), (x y), (x y), (x y)` per line."""
     photographs, out = sorted(folder.glob("*.jpg")), Figures()
     reference = [[_line(row) for row in path.with_suffix(".txt").read_text().splitlines()] for path in photographs]
     for who, found, arcs in by_both(photographs):
@@ -145,7 +145,7 @@ def _errors(found: Tags, reference: Tags) -> Iterator[np.ndarray]:
 
 
 def rooms(folder: Path) -> Figures:
-    """Photographs whose tags are listed in `groundtruth.txt`: a file and its numbers on each line. There are no wires in them."""
+    """Score photographs, without wires, whose tags are listed in `groundtruth.txt`: a file and its numbers on each line."""
     lines = [line.split() for line in (folder / "groundtruth.txt").read_text().splitlines()]
     listed, out = [set(map(int, numbers)) for _, *numbers in lines], Figures()
     for who, found, arcs in by_both([folder / name for name, *_ in lines]):
@@ -156,7 +156,7 @@ def rooms(folder: Path) -> Figures:
 
 
 def rotation(folder: Path) -> Figures:
-    """One tag on a turntable: the turn between each photograph's pose and that at 0 deg, against the angle in the file's name."""
+    """Score one tag on a turntable: rotation of each pose from that at 0 deg, against the angle in the file name."""
     about = yaml.safe_load((folder / "test_info.yaml").read_text())["rotation_test"]
     K, side = np.reshape(about["K"], (3, 3)), about["tag_size"]
     mount = CameraMount("camera", camera_of("", about["width"], about["height"], K, np.zeros(0)), np.zeros(3), np.eye(3))
@@ -173,14 +173,14 @@ def rotation(folder: Path) -> Figures:
 
 
 def _turns(attitudes: dict[int, np.ndarray]) -> Figures:
-    """By how much the turn since 0 deg is wrong, of attitudes (3, 3) by angle [deg]."""
+    """Return the errors of the rotation since 0 deg, for attitudes (3, 3) by angle [deg]."""
     off = [abs(np.degrees(np.linalg.norm(so3.log(R @ attitudes[0].T))) - abs(angle)) for angle, R in attitudes.items() if angle]
     return {"poses": len(attitudes), "error_deg_mean": float(np.mean(off)), "error_deg_max": float(np.max(off))}
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """By OpenCV, from views of a board: residual [px], lens, and poses (p_CS, R_CS) of the board in each view."""
+    """OpenCV's calibration from views of a board: residual [px], lens, and poses (p_CS, R_CS) of the board in each view."""
 
     rms: float
     camera: Camera
@@ -188,7 +188,7 @@ class Calibration:
 
 
 def calibrated(views: list[Tags], board: TagBoard, size: tuple[int, int]) -> Calibration:
-    """The lens (radial-tangential, four coefficients) of views of all a board's tags that are seen; `size`: width, height [px]."""
+    """Calibrate the lens (radial-tangential, four coefficients) from views of a board's tags; `size`: width, height [px]."""
     points = [np.concatenate([board.corners_S[board.ids.index(n)] for n, _ in view]).astype(np.float32) for view in views]
     pixels = [np.concatenate([corners for _, corners in view]).astype(np.float32) for view in views]
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
@@ -198,7 +198,7 @@ def calibrated(views: list[Tags], board: TagBoard, size: tuple[int, int]) -> Cal
 
 
 def aprilgrid(folder: Path) -> Figures:
-    """Photographs of Kalibr's grid: the tags in each, and how well one lens explains all of them."""
+    """Score photographs of Kalibr's grid: number of tags in each, and residual of one lens model for all."""
     board = TagBoard((0.75, 0.75), border=2, corner_squares=True, grid=TagGrid(6, 6, 0.088, 0.3, rotation=TURNED))
     images = [grey(path) for path in pictures_in(folder)]
     images = [cv2.resize(g, (WIDTH, round(WIDTH / g.shape[1] * g.shape[0])), interpolation=cv2.INTER_AREA) for g in images]
@@ -210,13 +210,13 @@ def aprilgrid(folder: Path) -> Figures:
 
 
 def clipboard_board(steps: np.ndarray, numbers: list[int]) -> TagBoard:
-    """Some of the sheet's tags; `steps`: from row to row and from column to column, in sides of a tag, shape (2,)."""
+    """Return a board of some of the sheet's tags; `steps`: spacing of rows and of columns, in sides of a tag, shape (2,)."""
     centres = {n: INCH * np.array(steps) * (ROWS // 2 - n // COLUMNS, COLUMNS // 2 - n % COLUMNS) for n in numbers}
     return TagBoard((0.5, 0.5), tuple(Tag(n, tuple(centre.tolist()), INCH, TURNED) for n, centre in centres.items()))
 
 
 def clipboard(folder: Path) -> Figures:
-    """Poses of eight boards of six tags in each image, drawn with a fixed seed, against the calibration by all tags in all images."""
+    """Score poses of eight boards of six random tags (fixed seed) per image, against a calibration from all tags and images."""
     images = [grey(path) for path in pictures_in(folder)]
     size, everything, rng = images[0].shape[::-1], list(range(ROWS * COLUMNS)), np.random.default_rng(0)
     views = [find_tags(image, guessed_mount("camera", *size).camera, PAD) for image in images]
@@ -246,13 +246,13 @@ def _rms(values: list[float]) -> float:
 
 
 def street(folder: Path) -> Figures:
-    """Photographs of wires that nobody has traced."""
+    """Count arcs in photographs of wires without a reference."""
     views = [seen(path) for path in pictures_in(folder)]
     return {"photographs": len(views), "arcs": sum(len(view.wires) for view in views)}
 
 
 def traced(folder: Path) -> Figures:
-    """Photographs in `test` whose wires' edges are traced in `test_gt`: precision and recall by length [%], within NEAR."""
+    """Score photographs in `test` with wire edges traced in `test_gt`: precision and recall by length [%], within NEAR."""
     lengths = np.array([_lengths(path, folder / "test_gt" / f"{path.stem}.mat") for path in pictures_in(folder / "test")], float)
 
     def shares(rows: np.ndarray) -> np.ndarray:
@@ -266,7 +266,7 @@ def traced(folder: Path) -> Figures:
 
 
 def _lengths(photograph: Path, reference: Path) -> tuple[int, int, int, int]:
-    """Of one photograph [px]: found and right, found, traced and found, traced."""
+    """Return lengths in one photograph [px]: correctly found, found, traced and found, traced."""
     view, edges = seen(photograph), loadmat(str(reference))["groundTruth"][0, 0]["Boundaries"][0, 0] > 0
     found = np.zeros(edges.shape, np.uint8)
     for wire in view.wires:
@@ -282,5 +282,5 @@ def _arc(wire: LineSighting, camera: Camera) -> np.ndarray:
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:
-    """Of each pixel from the nearest one of a mask [px]; infinite where it is empty."""
+    """Return each pixel's distance from the nearest one of a mask [px]; infinite if the mask is empty."""
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) if mask.any() else np.full(mask.shape, np.inf)

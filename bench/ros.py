@@ -1,4 +1,4 @@
-"""The graph's speed: how fast the whole stack passes simulation time, and whether 500 Hz holds by the wall clock."""
+"""Speed of the ROS graph: real-time factor of the whole stack, and whether it sustains 500 Hz in real time."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WINDOW = 1.0  # s
 
 
 class Probe(GraphNode):
-    """Listens to a running stack."""
+    """Node that measures a running stack."""
 
     def __init__(self) -> None:
         super().__init__("probe")
@@ -69,7 +69,7 @@ class Probe(GraphNode):
             self.stamp = stamp_of(Odometry, data)
 
     def delays(self) -> list[float]:
-        """From the publication of an IMU sample to that of the command that answers it, of the newest samples [us]."""
+        """Return the delays from the publication of an IMU sample to that of its motor command, of the newest samples [us]."""
         sent: dict[str, dict[int, int]] = {}
         for channel, subscription in self._newest.items():
             sent[channel] = {}
@@ -84,7 +84,7 @@ class Probe(GraphNode):
             self.diagnostics[status.name.rsplit("/", 1)[-1]] = {item.key: item.value for item in status.values}
 
     def count(self, node: str, key: str) -> int:
-        """A count in a node's diagnostics."""
+        """Return a count from a node's diagnostics."""
         return int(self.diagnostics.get(node, {}).get(key, 0))
 
     def take_off(self) -> None:
@@ -107,7 +107,7 @@ class Probe(GraphNode):
 
 @contextmanager
 def running(scenario: Scenario, folder: Path, **options) -> Iterator[tuple[Probe, Stack]]:
-    """A stack that is up and stepping, and a probe beside it."""
+    """Run a stack and a probe; yield both when the stack is ready and stepping."""
     with own_domain(), Stack(programs(scenario, folder=folder, **options), folder) as stack, closing(Probe()) as probe:
         stack.wait_until_ready(probe.visible_nodes)
         for _ in range(600):
@@ -120,9 +120,9 @@ def running(scenario: Scenario, folder: Path, **options) -> Iterator[tuple[Probe
 
 def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geometric",
               composed: tuple[str, ...] = CHAIN_NODES) -> list[Figure]:
-    """A hover without cameras by the wall clock: rates of the 500 Hz chain, and what was missed.
+    """Measure a hover without cameras in real time: rates of the 500 Hz chain, and missed deadlines.
 
-    The bars are those of the layout that `demo.py --realtime` has.
+    The bars are those of the layout of `demo.py --realtime`; with one process per node, only the delay has one.
     """
     where = f"real time, {law}" + ("" if composed else ", one process per node")
     overrides = {"vehicle": {"cameras": "none"}, "controller": {"controller.type": law}}
@@ -160,13 +160,13 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
 
 
 def processor_time(stack: Stack) -> float:
-    """That the busiest program's main thread has used so far, in which its nodes' callbacks run [s]; Linux."""
+    """Return the processor time used so far by the busiest program's main thread, which runs its nodes' callbacks [s]; Linux."""
     stats = [Path(f"/proc/{pid}/task/{pid}/stat").read_text().rpartition(")")[2].split() for pid in stack.pids.values()]
     return max(int(fields[11]) + int(fields[12]) for fields in stats) / os.sysconf("SC_CLK_TCK")
 
 
 def lockstep(scenario: Scenario, folder: Path, windows: int, composed: tuple[str, ...]) -> Figure:
-    """Simulation time per wall-clock time of the 500 Hz chain, without cameras."""
+    """Measure the real-time factor of the 500 Hz chain in lockstep, without cameras."""
     with running(scenario, folder, composed=composed, overrides={"vehicle": {"cameras": "none"}}) as (probe, _):
         factors = [_factor(probe) for _ in range(windows)]
     where = "one process" if composed else "one process per node"
@@ -180,7 +180,7 @@ def _factor(probe: Probe) -> float:
 
 
 def figures(quick: bool) -> list[Figure]:
-    """Whole flights with both cameras; the 500 Hz chain in lockstep and in real time."""
+    """Measure whole flights with both cameras, and the 500 Hz chain in lockstep and in real time."""
     scenario = dataclasses.replace(load_scenario("surface_90"), nodes=CHAIN)
     windows = 3 if quick else 10
     with tempfile.TemporaryDirectory(prefix="perch-bench-") as name:

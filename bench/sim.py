@@ -25,7 +25,7 @@ FLIGHT = [_pose(0.0, 0.1, 0.0), _pose(0.0, 0.6, 0.0), _pose(0.0, 1.2, 0.0), _pos
 
 
 def figures(quick: bool) -> list[Figure]:
-    """Median over a whole flight per camera; frames with motion blur; coloured frames with cables; building a scene."""
+    """Measure a whole flight per camera, frames with motion blur, coloured frames with cables, and the building of a scene."""
     cv2.setNumThreads(1)
     scenario, vehicle = load_scenario("surface_90"), load_vehicle("snapdragon")
     rng = np.random.default_rng(0)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure the speed bars of perch and say whether they hold on this machine."""
+"""Run the benchmarks of perch and check whether their bars hold on this machine."""
 
 from __future__ import annotations
 

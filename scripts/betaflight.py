@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Betaflight as a program on this machine: build it, say where it is, or set a vehicle's autopilot up. `--help` shows the options."""
+"""Betaflight as a program on this machine: build it, print its path, or configure an autopilot. `--help` shows the options."""
 
 from perch_setup import run
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Kill, stop and restart nodes in flight, disturb their messages, and see how every flight ends. `--help` shows the options."""
+"""Kill, stop and restart nodes in flight, disturb their messages, and record how each flight ends. `--help` shows the options."""
 
 from perch_setup import run
 

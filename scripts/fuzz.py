@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Hunt for inputs that crash, hang, or are taken for sense though they make none. What is found is kept, and is a test from then on."""
+"""Search for inputs that crash or hang a component, or are accepted although invalid. Inputs found are kept as test cases."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ exit code: 0 nothing found, 1 something found, 2 wrong arguments"""
 
 
 def main() -> int:
-    """Hunt inputs of one kind; the kinds are modules of tests/fuzzing."""
+    """Fuzz inputs of one kind; the kinds are modules of tests/fuzzing."""
     kinds = sorted(path.stem for path in (ROOT / "tests" / "fuzzing").glob("*.py") if "\ndef run(" in path.read_text())
     parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("kind", choices=kinds, help="of inputs")

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write docs/limits.md: sizes, counts, magnitudes and rates of everything that enters."""
+"""Write docs/limits.md: limits on size, count, magnitude and rate of all inputs."""
 
 from perch_setup import run
 

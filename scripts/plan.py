@@ -70,7 +70,7 @@ KINDS = {"perch": _plan_perch, "powerline": _plan_powerline}
 
 
 def _apply(mapping: dict, changes: list[str]) -> None:
-    """Put `key=value` pairs into the section `settings`; dots lead into groups."""
+    """Put `key=value` pairs into the section `settings`; dots separate groups."""
     from perch_core.config import flattened, nested, parse_yaml
     from perch_core.errors import ConfigError
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Start one node, as `ros2 run` does, on machines without the `ros2` command.
 
-The node gets its parameter file config/<node>.yaml; what follows the node's name goes to the node and comes
-after the file, so that it counts.
+The node gets its parameter file config/<node>.yaml. Arguments after the node's name are passed on to the node,
+after the file, so that they take precedence.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ EXAMPLES = """examples:
 
 
 def main() -> int:
-    """Become the node; 2 for a node that does not exist."""
+    """Replace this process by the node; return 2 if node or network are refused."""
     parser = command_parser(__doc__, EXAMPLES, allow_abbrev=False)
     parser.add_argument("node", metavar="NODE", help="as in config/scenarios: vehicle, controller, ...")
     parser.add_argument("--no-config", action="store_true", help="do not pass config/<node>.yaml")

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Make sensor files of calibrations, and check recordings. `--help` shows the options."""
+"""Make sensor files from calibrations, and check recordings. `--help` shows the options."""
 
 import sys
 

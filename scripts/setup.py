@@ -17,7 +17,7 @@ EXAMPLES = """examples:
 
 
 def main() -> None:
-    """Set up and say how to go on."""
+    """Set up and print how to continue."""
     parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("--clean", action="store_true", help="remove .venv, build and install first")
     parser.add_argument("--extra", action="append", default=[], choices=EXTRAS,

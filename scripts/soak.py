@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Perch, depart and perch again in one run of the stack, and see whether anything grows. `--help` shows the options."""
+"""Perch, depart and perch again in one run of the stack, and check for growth of its resources. `--help` shows the options."""
 
 from perch_setup import run
 

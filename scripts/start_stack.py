@@ -53,7 +53,7 @@ def command_line() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """0 stopped by the caller, 1 a node ended by itself, 2 the caller's mistake."""
+    """Run the script; return 0 if stopped by the caller, 1 if a node ended by itself, 2 for the caller's mistake."""
     parser = command_line()
     arguments = parser.parse_args()
     if arguments.domain is not None and not 0 <= arguments.domain <= 101:
@@ -90,7 +90,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     Raises:
         PerchError: scenario, nodes or parameters are refused.
-        StackError: a node ended, or did not get ready.
+        StackError: a node ended, or did not become ready.
     """
     from perch_core import config
     from perch_sim.scenario import load_scenario
@@ -124,12 +124,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def own_folder() -> Path:
-    """Where logs go by default: several stacks, one for each vehicle, may start in the same second."""
+    """Return the default log folder; it has the process id, as several stacks may start in the same second."""
     return ROOT / "out" / "stack" / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}"
 
 
 def printer(names: list[str]):
-    """Prints lines with the program's name in front, in colour on a terminal."""
+    """Return a function that prints lines with the program's name in front, in colour on a terminal."""
     width = max(map(len, names))
     colours = dict(zip(names, COLOURS * (1 + len(names) // len(COLOURS))))
     terminal = sys.stdout.isatty()

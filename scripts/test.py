@@ -21,9 +21,9 @@ PARTS = (
     ("tests/recordings/",), ("tests/system/test_bad_input.py",), ("tests/system/test_campaign.py",), ("tests/unit/test_goals_in_a_row.py",),
     ("tests/fuzz/test_messages.py",), ("tests/unit/test_vio_filter.py",), ("tests/unit/test_vio_images.py",), ("tests/unit/test_control_nmpc.py",),
 )
-"""What takes longest, so it begins first; files and folders of one part share what is dear to make. Each other file is a part."""
+"""The longest parts, which start first; files and folders of one part share expensive fixtures. Each other file is a part."""
 PROCESSES = 1 + min(os.cpu_count() or 1, 5)
-"""One more than there are cores: some tests wait for clocks, or for processes that they have started; with two more, those in real time starve."""
+"""One more than cores (at most 6), as some tests wait for clocks or processes; with two more, real-time tests starve."""
 KEPT = ROOT / ".perch" / "pycache"
 
 EXAMPLES = """examples:
@@ -48,7 +48,7 @@ def main() -> int:
 
 
 def run_tests(quick: bool, fast: bool, for_pytest: list[str]) -> int:
-    """Run pytest in this process, which keeps a ROS domain to itself meanwhile, or in several that share all tests or the quick ones."""
+    """Run pytest with a reserved ROS domain, in this process or in several that share all tests or the quick ones."""
     from perch_eval.domain import free_domain
 
     os.environ["ROS_DOMAIN_ID"] = str(free_domain())
@@ -65,7 +65,7 @@ def run_tests(quick: bool, fast: bool, for_pytest: list[str]) -> int:
 
 
 def run_pytest(arguments: list[str], *plugins: object) -> int:
-    """Run pytest in this process; its exit code as `main` has it."""
+    """Run pytest in this process; return the exit code as in `main`."""
     import pytest
 
     code = pytest.main(arguments, plugins)
@@ -73,17 +73,17 @@ def run_pytest(arguments: list[str], *plugins: object) -> int:
 
 
 class Beforehand:
-    """A plugin of pytest: the processes that fork scripts and nodes load their code while the tests are collected, on a core that is idle then."""
+    """Pytest plugin that starts the fork servers of scripts and nodes while tests are collected, when a core is idle."""
 
     def pytest_sessionstart(self) -> None:
-        """The processes that share the tests share these, too."""
+        """Start the fork servers, which all test processes share."""
         from system.forks import NODES, SCRIPTS, forks
 
         forks(NODES), forks(SCRIPTS)
 
 
 class Share:
-    """A plugin of pytest: when the tests are collected, processes are forked, each of which takes the next part whenever it is through with one."""
+    """Pytest plugin that forks processes after the collection of tests; each takes the next part when it has finished one."""
 
     def __init__(self, parts: list[tuple[str, ...]], processes: int) -> None:
         self._parts, self._processes = parts, processes
@@ -99,7 +99,7 @@ class Share:
         return self._parts[int.from_bytes(number, "big")] if number else None
 
     def pytest_runtestloop(self, session) -> bool:
-        """In place of pytest's own."""
+        """Fork the other processes and run parts of the tests, in place of pytest's own loop."""
         if session.testsfailed:
             raise session.Interrupted(f"{session.testsfailed} files could not be collected")
         sys.stdout.flush()
@@ -120,9 +120,9 @@ class Share:
         return True
 
     def end(self, code: int) -> NoReturn:
-        """End this process: the others with their own exit code, the first one with that of all, when what the others print is printed.
+        """End this process: a forked one with its own code, the first one, after printing the others' output, with that of all.
 
-        Not by the C library's exit, in which threads of Fast DDS crash that tests have left.
+        The C library's exit is avoided, as threads of Fast DDS that tests have left crash in it.
         """
         for pid, output in self._others:
             with output:
@@ -139,7 +139,7 @@ class Share:
 
 
 def become_another(config, output: IO[str]) -> None:
-    """Be a process of tests of its own: domain, output, and what is left of pytest's cache when the first one has written it."""
+    """Set up a forked test process: own ROS domain and output; pytest's cache is written by the first process only."""
     from perch_core.processes import end_with_parent
     from perch_eval.domain import free_domain
 
@@ -155,17 +155,17 @@ def become_another(config, output: IO[str]) -> None:
 
 
 def within(name: str, file: str) -> bool:
-    """Whether a file is that of a part, or lies in its folder."""
+    """Return whether a file is the named one, or lies in the named folder."""
     return file == name or name.endswith("/") and file.startswith(name)
 
 
 def test_files() -> list[str]:
-    """All of them, relative to the repository."""
+    """Return all test files, relative to the repository."""
     return sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py"))
 
 
 def parts(files: list[str]) -> list[tuple[str, ...]]:
-    """`PARTS` as far as there are such files, then each of the others, those of whole stacks first."""
+    """Return `PARTS` as far as their files exist, then each other file, those of tests/system first."""
     found = [tuple(name for name in part if any(within(name, file) for file in files)) for part in PARTS]
     named = [name for part in PARTS for name in part]
     others = [(file,) for file in files if not any(within(name, file) for name in named)]

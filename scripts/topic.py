@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Look at topics, with arguments of `ros2 topic`, on machines without the `ros2` command."""
+"""Inspect topics and publish, with the arguments of `ros2 topic`, on machines without the `ros2` command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turns a bare machine into one on which perch runs, and enters that environment.
+"""Set-up of perch on a bare machine, and entry into its environment.
 
 Only the standard library is used here, because nothing else is installed when this code first runs.
 """

@@ -1,4 +1,4 @@
-"""Lets one process at a time set up; the others wait, then find the work done."""
+"""Lock by which one process at a time sets up; the others wait, then find the work done."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _held: list[int] = []
 
 
 def held() -> tuple[int, ...]:
-    """File descriptors of the lock, to be passed on to pip and colcon.
+    """Return the file descriptors of the lock, to be passed on to pip and colcon.
 
-    The kernel frees the lock when the last holder ends. With its tools among the holders, a killed
-    set-up keeps the lock until they have ended too, and the next one does not write where they write.
+    The kernel releases the lock when its last holder ends. As the tools hold it as well, the lock of a killed
+    set-up is kept until they have ended, and the next set-up does not write to the same files.
     """
     return tuple(_held)
 

@@ -17,13 +17,13 @@ from .layout import VENV, VENV_PYTHON
 from .prepare import prepare
 
 _ENTERED = "PERCH_ENTERED"
-"""Process id of the script that was started again inside. An `exec` keeps the id; children have others."""
+"""Variable with the id of the process restarted in the environment. An `exec` keeps the id; children have others."""
 INTERRUPTED = 130
 _HELP = {"-h", "--help"}
 
 
 def command_parser(description: str, examples: str, **options) -> argparse.ArgumentParser:
-    """A command line with examples below its help, which stay as they are written; `options` are those of `ArgumentParser`."""
+    """Return a parser whose help shows description and examples verbatim; `options` are those of `ArgumentParser`."""
     return argparse.ArgumentParser(description=description, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter, **options)
 
 
@@ -31,9 +31,9 @@ def enter(*extras: str) -> None:
     """Set up if necessary, then start this script again with our Python and variables.
 
     Args:
-        extras: packages that this script needs beside those of a flight; not for its `--help`.
+        extras: packages that this script needs in addition to those of a flight; not installed for its `--help`.
 
-    Returns only inside the environment. Prints one line and exits where set-up cannot be done.
+    Returns only inside the environment. Prints one line and exits if set-up fails.
     """
     if os.environ.get(_ENTERED) == str(os.getpid()) and sys.prefix == str(VENV):
         with quiet_on_interrupt():
@@ -49,7 +49,7 @@ def enter(*extras: str) -> None:
 
 @contextmanager
 def setting_up() -> Iterator[None]:
-    """A set-up that cannot be done, or is interrupted, ends the script with one line."""
+    """End the script with one line if set-up in this context fails or is interrupted."""
     try:
         yield
     except SetupError as error:
@@ -61,13 +61,13 @@ def setting_up() -> Iterator[None]:
 
 
 def become(path: str, arguments: list[str], environment: Mapping[str, str] = os.environ) -> NoReturn:
-    """Start another program in this process. Python shows a traceback of Ctrl-C while it starts: one is held back until our code runs."""
+    """Replace this process by another program. Ctrl-C is blocked until our code runs, as Python would show a traceback."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.execve(path, arguments, environment)
 
 
 def run(module: str, *extras: str) -> NoReturn:
-    """Set up if necessary, with extras, then be the program that a module's `main` is, with its options and its exit code."""
+    """Set up if necessary, with extras, then run a module's `main` on this command line and exit with its code."""
     enter(*extras)
     with quiet_on_interrupt():
         main = importlib.import_module(module).main
@@ -75,13 +75,13 @@ def run(module: str, *extras: str) -> NoReturn:
 
 
 def leave_quietly_on_interrupt() -> None:
-    """Let Ctrl-C end a script without a traceback, also where it is not waiting in our code."""
+    """Let Ctrl-C end a script without a traceback, also outside our own code."""
     signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
 
 
 @contextmanager
 def quiet_on_interrupt() -> Iterator[None]:
-    """Around imports, which take seconds: Ctrl-C ends the script without a traceback."""
+    """Let Ctrl-C end the script without a traceback in this context; for imports, which take seconds."""
     before = signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
     try:
         yield

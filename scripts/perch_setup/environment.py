@@ -13,15 +13,15 @@ _OURS = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH", "PYTHON
 
 
 def variables(wanted: Platform, with_workspace: bool = True) -> dict[str, str]:
-    """What `source setup.bash` gives, on top of the caller's variables.
+    """Return the variables of `source setup.bash`, on top of the caller's variables.
 
     Args:
         wanted: where ROS comes from. With our wheels, leftovers of other workspaces are dropped;
-            with an installation they are its own and stay.
+            with an installation they belong to it and are kept.
         with_workspace: whether the built packages are part of it.
 
     Raises:
-        SetupError: where sourcing fails.
+        SetupError: sourcing fails.
     """
     start = {key: value for key, value in os.environ.items() if not (wanted.uses_wheels and key in _OURS)}
     start["PERCH_WITHOUT_WORKSPACE"] = "" if with_workspace else "1"

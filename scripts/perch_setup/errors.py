@@ -1,4 +1,4 @@
-"""The one error of the set-up."""
+"""The error of the set-up."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ FAILED = 1
 
 
 class SetupError(Exception):
-    """Set-up cannot go on.
+    """Raised when set-up cannot continue.
 
     Args:
         message: what is wrong and what to do about it, for a person.

@@ -1,4 +1,4 @@
-"""What this machine offers: Python, processor, compilers, and perhaps a ROS installation."""
+"""Checks of this machine: Python, processor, compilers, and a possible ROS installation."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ INSTALLED = Platform("installed", (REQUIREMENTS / "python-ros-jazzy.lock",))
 
 
 def detect_platform(environment: Mapping[str, str] = os.environ) -> Platform:
-    """Wheels, or the ROS installation that is sourced.
+    """Return wheels, or the ROS installation that is sourced.
 
-    A workspace that was built with an installation stays with it in a shell where nothing is sourced.
+    A workspace that was built with an installation keeps using it in a shell where none is sourced.
 
     Args:
         environment: environment variables of the calling shell.
 
     Raises:
-        SetupError: where another ROS distribution than Jazzy is sourced, or a Jazzy that is not there.
+        SetupError: another ROS distribution than Jazzy is sourced, or a Jazzy that is not installed.
     """
     distribution = environment.get("ROS_DISTRO", "")
     if distribution == DISTRIBUTION and _sourced_prefix(environment) is None:
@@ -66,7 +66,7 @@ def detect_platform(environment: Mapping[str, str] = os.environ) -> Platform:
 
 
 def remember(chosen: Platform, environment: Mapping[str, str] = os.environ) -> None:
-    """Write down which installation was used, for `setup.bash` and for later starts."""
+    """Record which installation was used, for `setup.bash` and for later starts."""
     if chosen.uses_wheels:
         ROS_PREFIX.unlink(missing_ok=True)
         return
@@ -76,14 +76,14 @@ def remember(chosen: Platform, environment: Mapping[str, str] = os.environ) -> N
 
 
 def _sourced_prefix(environment: Mapping[str, str]) -> Optional[Path]:
-    """The ROS installation that is sourced, the lowest underlay; ours from wheels is none."""
+    """Return the sourced ROS installation, the lowest underlay; our own wheels do not count."""
     prefixes = [Path(prefix) for prefix in environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
     found = [prefix for prefix in prefixes if (prefix / "share" / "rclpy").exists() and ROOT not in prefix.parents]
     return found[-1] if found else None
 
 
 def _remembered_installation() -> bool:
-    """Whether the installation of an earlier set-up is still there."""
+    """Return whether the installation of an earlier set-up still exists."""
     try:
         return Path(ROS_PREFIX.read_text(), "setup.bash").exists()
     except OSError:
@@ -91,10 +91,10 @@ def _remembered_installation() -> bool:
 
 
 def check_python(wanted: Platform, version: Sequence[int] = sys.version_info[:2]) -> None:
-    """Refuse a Python or a processor that no lock file fits.
+    """Check that the lock files fit this Python, operating system and processor.
 
     Raises:
-        SetupError: naming what was found, what is needed, and a usable Python if there is one.
+        SetupError: they do not; the message names what was found, what is needed, and a usable Python if there is one.
     """
     if tuple(version) not in PYTHONS:
         known = " or ".join(f"{major}.{minor}" for major, minor in PYTHONS)
@@ -110,10 +110,10 @@ def check_python(wanted: Platform, version: Sequence[int] = sys.version_info[:2]
 
 
 def check_tools() -> None:
-    """Refuse to start where a system tool is missing.
+    """Check that all required system tools are installed.
 
     Raises:
-        SetupError: with each missing tool and the apt line that installs all of them.
+        SetupError: tools are missing; the message has their names and the apt command that installs them.
     """
     missing = {tool: tool for tool in ("cmake", "g++", "make", "bash") if shutil.which(tool) is None}  # tool -> its apt package
     if importlib.util.find_spec("ensurepip") is None:
@@ -125,6 +125,6 @@ def check_tools() -> None:
 
 
 def _apt_python() -> str:
-    """How apt's packages for the Python that runs this begin: those of its default Python, and of one that it did not install, `python3`."""
+    """Return the name prefix of apt's packages for the running Python; `python3` for apt's default one, or one not from apt."""
     own = f"python{sys.version_info[0]}.{sys.version_info[1]}"
     return own if Path(sys.base_prefix) == Path("/usr") and Path("/usr/bin/python3").resolve().name != own else "python3"

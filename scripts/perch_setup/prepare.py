@@ -22,17 +22,17 @@ WARM_UP = "perch_eval.warm_up"
 
 
 def prepare(clean: bool = False, extras: Collection[str] = ()) -> Platform:
-    """Set up whatever is not: fast where nothing is to do, and safe to interrupt and repeat.
+    """Set up what is missing; fast if there is nothing to do, and safe to interrupt and repeat.
 
     Args:
         clean: start from nothing.
-        extras: packages to have beside those of a flight, names of `requirements/extras`.
+        extras: packages in addition to those of a flight, names in `requirements/extras`.
 
     Returns:
         Where ROS comes from.
 
     Raises:
-        SetupError: where the machine lacks something or a step fails.
+        SetupError: the machine lacks something, or a step fails.
     """
     wanted = detect_platform()
     if not clean and _nothing_to_do(wanted, stamps.load(), extras):
@@ -53,7 +53,7 @@ def prepare(clean: bool = False, extras: Collection[str] = ()) -> Platform:
 
 
 def _install(wanted: Platform, done: dict[str, str]) -> None:
-    """Install the locked packages, unless they are."""
+    """Install the locked packages, unless they are up to date."""
     environment = stamps.environment_stamp(wanted)
     if done.get("environment") == environment and virtualenv.usable():
         return
@@ -77,7 +77,7 @@ def _install(wanted: Platform, done: dict[str, str]) -> None:
 
 
 def _install_extras(wanted: Platform, done: dict[str, str], extras: Collection[str]) -> None:
-    """Install the locked packages of extras, unless they are."""
+    """Install the locked packages of extras, unless they are up to date."""
     for extra in extras:
         stamp = stamps.extra_stamp(extra, done["environment"])
         if done.get(f"extra {extra}") == stamp:
@@ -108,10 +108,10 @@ def _build(wanted: Platform, done: dict[str, str]) -> None:
 
 @contextlib.contextmanager
 def _compiled(wanted: Platform, done: dict[str, str]) -> Iterator[None]:
-    """Compile the numerics into their caches where their sources have changed: those of a flight without ROS beside the building,
-    which leaves cores idle, and after it what only nodes call.
+    """Compile the numerics into their caches if their sources have changed: those of a flight without ROS in parallel with the
+    build, which leaves cores idle, and after it those that only nodes call.
 
-    Nothing depends on it: what is not cached is compiled when a node first needs it. So a failure is only mentioned.
+    A failure is only reported, as kernels that are not cached are compiled when a node first needs them.
     """
     stamp = stamps.kernel_stamp(done["environment"])
     if done.get("warmed") == stamp:

@@ -37,17 +37,17 @@ class Step:
         self._write(f"{word} in {time.monotonic() - self._start:.0f} s", final=True)
 
     def show(self, detail: str) -> None:
-        """Report progress; at most every ten seconds where nobody sees a terminal."""
+        """Report progress; without a terminal, at most every ten seconds."""
         now = time.monotonic()
         if self._terminal or now - self._shown > _QUIET_PERIOD_S:
             self._write(detail)
 
     def run(self, command: Sequence[object], log: str, environment: Mapping[str, str],
             describe: Callable[[str], Optional[str]] = lambda line: None) -> None:
-        """Run a tool, log its output, show what `describe` makes of its lines.
+        """Run a tool, log its output, and show what `describe` returns for each line.
 
         Raises:
-            SetupError: with the last lines of its output where the tool fails.
+            SetupError: the tool fails; the message has the last lines of its output.
         """
         file = STATE / "log" / f"{log}.log"
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -80,7 +80,7 @@ class Step:
 
 
 def _let_finish(process: subprocess.Popen) -> None:
-    """After Ctrl-C, which the tool received as well: let it end, then make it end."""
+    """Wait for a tool to end after Ctrl-C, which it received as well; kill it after a time-out."""
     try:
         process.wait(timeout=5.0)
     except subprocess.TimeoutExpired:

@@ -1,4 +1,4 @@
-"""Takes away what wheels bring and nobody uses."""
+"""Removal of unused files of installed wheels."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _UNUSED = (
     *(f"casadi/{name}" for name in ("include", "*.a", "liblacemodelica*", "libcasadi_graphmodel_onnx*", "libantlr4*")),
     *(f"casadi/lib*{name}*" for name in ("highs", "alpaqa", "uno", "Clp", "Cbc", "Cgl", "Osi", "CoinUtils", "bonmin")),
 )
-"""The libraries' own tests; of CasADi headers, importers and all solvers but those that perch calls (fatrop, ipopt) or that are small."""
+"""The libraries' own tests; CasADi's headers, importers and solvers, except small ones and those in use (fatrop, ipopt)."""
 _WITH_SYMBOLS = ("llvmlite/**", "zstandard", "fontTools/**", "kiwisolver", "lz4/**", "yaml", ".")
-"""Folders whose libraries were published with a debugger's symbols. Only those that hold no libraries of their own beside them: `strip` may
-damage what the maker of such a wheel has patched."""
+"""Folders whose libraries were published with debug symbols. Wheels that bundle further libraries are left out, as `strip`
+may damage libraries that were patched for bundling."""
 
 
 def slim(packages: Path) -> None:
-    """Make a `site-packages` smaller, by a third. Repeating it changes nothing."""
+    """Reduce the size of a `site-packages` by a third. Idempotent."""
     for path in [path for pattern in _UNUSED for path in packages.glob(pattern)]:
         if path.is_dir():
             shutil.rmtree(path)
@@ -34,7 +34,7 @@ def slim(packages: Path) -> None:
 
 
 def strip(library: Path) -> None:
-    """Take a debugger's symbols out of a library, which may be in use."""
+    """Remove the debug symbols of a library, which may be in use."""
     draft = library.with_name(f"{library.name}.stripped")
     done = subprocess.run(["strip", "--strip-unneeded", "-o", draft, library], stderr=subprocess.DEVNULL, check=False).returncode == 0
     if done and draft.stat().st_size < library.stat().st_size:
@@ -45,12 +45,12 @@ def strip(library: Path) -> None:
 
 
 def link_copies(folder: Path, pattern: str = "*.so*") -> int:
-    """Replace equal files below a folder by links to one of them: wheels cannot hold links, nor share a library.
+    """Replace equal files below a folder by hard links to one of them, as wheels can neither hold links nor share a library.
 
-    A file system that knows no links keeps the copies.
+    On a file system without hard links the copies are kept.
 
     Returns:
-        Bytes that are free again.
+        Number of bytes saved.
     """
     def size(file: Path) -> int:
         return file.stat().st_size

@@ -1,4 +1,4 @@
-"""Remembers what was set up from what, so that a second start finds out quickly that all is done."""
+"""Stamps of the inputs of completed set-up steps, by which a later start quickly detects that nothing is to do."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ _BUILD_FILES = ("package.xml", "setup.py", "setup.cfg", "CMakeLists.txt")
 
 
 def environment_stamp(wanted: Platform) -> str:
-    """Changes whenever the virtual environment has to be installed anew.
+    """Return a stamp that changes whenever the virtual environment has to be installed again.
 
-    The Python that runs this is not part of it: an environment keeps the one it was made with.
+    The Python that runs this is not part of it, as an environment keeps the one it was made with.
     """
     mending = (Path(__file__).with_name(name) for name in ("wheel_paths.py", "slim.py"))
     return _digest((*wanted.locks, *mending), wanted.ros, str(ROOT))
 
 
 def extra_stamp(extra: str, environment: str) -> str:
-    """Changes whenever the packages of an extra have to be installed again."""
+    """Return a stamp that changes whenever the packages of an extra have to be installed again."""
     return _digest((EXTRAS[extra],), environment)
 
 
 def package_stamp(package: Path, environment: str) -> str:
-    """Changes whenever colcon has to build a package again.
+    """Return a stamp that changes whenever colcon has to build a package again.
 
     Python modules are not part of it: they are linked into the workspace, so edits are live. Of
-    configuration files, which are linked too, only the names count.
+    configuration files, which are linked as well, only the names count.
     """
     interfaces = (file for kind in ("msg", "srv", "action") for file in sorted((package / kind).glob("*")))
     files = [*(package / name for name in _BUILD_FILES), *interfaces]
@@ -42,15 +42,15 @@ def package_stamp(package: Path, environment: str) -> str:
 
 
 def kernel_stamp(environment: str) -> str:
-    """Changes whenever there is something to compile: with every file that holds compiled kernels."""
+    """Return a stamp that changes with every file that holds compiled kernels."""
     files = (file for file in sorted(SOURCES.rglob("*.py")) if b"@compiled" in file.read_bytes())
     return _digest(files, environment)
 
 
 def packages(wanted: Platform) -> list[Path]:
-    """The folders of all packages to build: those of ROS itself only where the sourced installation lacks them.
+    """Return the folders of all packages to build; those of ROS itself only if the sourced installation lacks them.
 
-    With our wheels nothing that is sourced counts: it may be another checkout of perch.
+    With our wheels, sourced packages are ignored, as they may be those of another checkout of perch.
     """
     sourced = "" if wanted.uses_wheels else os.environ.get("AMENT_PREFIX_PATH", "")
     prefixes = [Path(prefix) for prefix in sourced.split(os.pathsep) if prefix and not prefix.startswith(str(ROOT))]
@@ -59,7 +59,7 @@ def packages(wanted: Platform) -> list[Path]:
 
 
 def load() -> dict[str, str]:
-    """Stamps of everything that is done; empty where nothing is, or where the file is damaged."""
+    """Return the stamps of all completed steps; empty if there are none or the file is damaged."""
     try:
         stamps = json.loads(_FILE.read_text())
     except (OSError, ValueError, RecursionError):
@@ -68,7 +68,7 @@ def load() -> dict[str, str]:
 
 
 def save(stamps: dict[str, str]) -> None:
-    """Replace all stamps at once: a reader never sees half a file."""
+    """Replace all stamps atomically: no reader gets half a file."""
     STATE.mkdir(exist_ok=True)
     draft = _FILE.with_suffix(f".{os.getpid()}")
     draft.write_text(json.dumps(stamps, indent=1))

@@ -16,19 +16,19 @@ from .slim import slim
 from .wheel_paths import mend_wheels
 
 _UNFINISHED = STATE / "installing"
-"""Exists from before the environment is made until pip is done. A killed venv leaves a Python without pip, a killed pip packages that are none."""
+"""Marker file that exists until pip is done. A killed venv leaves a Python without pip, a killed pip leaves broken packages."""
 _USER_SETTINGS = ("PIP_TARGET", "PIP_PREFIX", "PIP_REQUIRE_VIRTUALENV", "PYTHONHOME", "PYTHONSTARTUP")
 
 
 def install(wanted: Platform, fresh: bool) -> None:
-    """Bring the virtual environment to exactly the locked versions.
+    """Install the locked versions into the virtual environment.
 
     Args:
         wanted: where ROS comes from, and the lock files.
-        fresh: start from an empty environment, as for another Python or another source of ROS.
+        fresh: start from an empty environment, as for another source of ROS or a moved checkout.
 
     Raises:
-        SetupError: where a tool fails.
+        SetupError: a tool fails.
     """
     environment = _environment(wanted)
     STATE.mkdir(exist_ok=True)
@@ -52,7 +52,7 @@ def install_extra(wanted: Platform, extra: str) -> None:
     """Install the packages of an extra into the virtual environment.
 
     Raises:
-        SetupError: where pip fails, as it does without network.
+        SetupError: pip fails, as it does without network.
     """
     unfinished = STATE / f"installing_{extra}"
     again = ["--ignore-installed"] if unfinished.exists() else []  # a killed pip leaves packages that are none
@@ -64,7 +64,7 @@ def install_extra(wanted: Platform, extra: str) -> None:
 
 
 def _pip(step: Step, environment: Mapping[str, str], total: int, *locks: Path, options: Sequence[str] = ()) -> None:
-    """Install so many packages of lock files, without what nobody uses.
+    """Install the `total` packages of lock files, without their unused files.
 
     The locks are complete, so pip has nothing to resolve; tests check that they fit together.
     """
@@ -76,12 +76,12 @@ def _pip(step: Step, environment: Mapping[str, str], total: int, *locks: Path, o
 
 
 def usable() -> bool:
-    """Whether there is an environment that was finished; what venv writes last is there."""
+    """Return whether there is a completed environment; venv writes `activate` last."""
     return VENV_PYTHON.exists() and (VENV_PYTHON.parent / "activate").exists() and not _UNFINISHED.exists()
 
 
 def _environment(wanted: Platform) -> dict[str, str]:
-    """The caller's environment without what would lead pip astray."""
+    """Return the caller's environment without variables that interfere with pip."""
     environment = {key: value for key, value in os.environ.items() if key not in _USER_SETTINGS}
     environment.update(PIP_USER="0", PYTHONNOUSERSITE="1")
     if wanted.uses_wheels:
@@ -91,12 +91,12 @@ def _environment(wanted: Platform) -> dict[str, str]:
 
 
 def _pins(lock: str) -> int:
-    """Number of packages that a lock file names."""
+    """Return the number of packages in a lock file."""
     return len(re.findall(r"^[a-zA-Z0-9]", lock, re.MULTILINE))
 
 
 def _narrator(total: int) -> Callable[[str], Optional[str]]:
-    """Turns pip's lines into a count."""
+    """Return a function that turns pip's lines into a count."""
     count = 0
 
     def describe(line: str) -> Optional[str]:

@@ -1,4 +1,4 @@
-"""Mends the ROS wheels: their CMake exports carry paths of the machine that built them."""
+"""Repair of the ROS wheels, whose CMake exports have paths of the machine that built them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def mend(text: str, python_include: str, numpy_include: str) -> str:
 
 
 def mend_wheels(prefix: Path) -> int:
-    """Mend every export below a virtual environment. Repeating it changes nothing.
+    """Repair every export below a virtual environment. Idempotent.
 
     Returns:
         The number of files that were changed.

@@ -13,7 +13,7 @@ from .machine import Platform
 from .progress import Step
 
 _COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
-"""Started through our Python, so that the executables it writes run in our Python too."""
+"""Colcon is started by our Python, so that the executables that it writes run in our Python as well."""
 
 
 def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
@@ -22,10 +22,10 @@ def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
     Args:
         selected: folders of the packages to build.
         wanted: where ROS comes from.
-        fresh: throw away everything that was built before.
+        fresh: remove everything that was built before.
 
     Raises:
-        SetupError: with the last lines of the compiler where a package does not build.
+        SetupError: a package does not build; the message has the last lines of the compiler.
     """
     names = sorted(folder.name for folder in selected)
     # Each from an empty folder: what a killed build left is not sound, nor is typesupport that was linked with a message that has gone.
@@ -43,7 +43,7 @@ def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
 
 
 def _environment(wanted: Platform) -> dict[str, str]:
-    """What colcon, CMake and the generators need around them."""
+    """Return the environment variables for colcon, CMake and the generators."""
     environment = variables(wanted, with_workspace=False)
     environment["PYTHONNOUSERSITE"] = "1"
     environment["PWD"] = str(ROOT)
@@ -53,7 +53,7 @@ def _environment(wanted: Platform) -> dict[str, str]:
 
 
 def _narrated(line: str) -> Optional[str]:
-    """What a line of colcon tells: the name of a package that begins, or make's percentage of one with messages."""
+    """Return the progress in a line of colcon: the name of a package that begins, or make's percentage of a message package."""
     started = re.match(r"Starting >>> (\S+)", line)
     percentage = re.match(r"\[ *(\d+)%\] .*?\b(\w+?_msgs)", line)  # several packages are built at the same time
     if started:

@@ -1,4 +1,4 @@
-"""What `ros2 topic`, `param`, `service` and `action` do, for machines without the `ros2` command.
+"""Replacement of `ros2 topic`, `param`, `service` and `action` for machines without the `ros2` command.
 
 Only `commands` may be imported outside of perch's environment; everything else needs rclpy.
 """

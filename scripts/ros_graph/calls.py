@@ -1,4 +1,4 @@
-"""Sends requests and goals."""
+"""Sub-commands that send requests and goals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STATUS = {
 
 
 def call_service(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`service.py call`: prints the response; 1 where it says `success: false`."""
+    """Run `service.py call`: print the response; return 1 if it has `success: false`, otherwise 0."""
     cls = interface(arguments.type, "srv")
     request = fill(cls.Request(), parse(arguments.values, "request"))
     service = graph.absolute(arguments.service)
@@ -34,7 +34,7 @@ def call_service(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def send_goal(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`action.py send_goal`: 0 where the goal succeeds, 1 where it does not. Ctrl-C cancels the goal."""
+    """Run `action.py send_goal`: return 0 if the goal succeeds, otherwise 1. Ctrl-C cancels the goal."""
     cls = interface(arguments.type, "action")
     goal = fill(cls.Goal(), parse(arguments.values, "goal"))
     action = graph.absolute(arguments.action)
@@ -60,7 +60,7 @@ def send_goal(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def _result(graph: Visit, handle: ClientGoalHandle):
-    """The goal's result, however long it takes; after Ctrl-C that of the cancelled goal."""
+    """Wait for the goal's result, without time-out; after Ctrl-C, for that of the cancelled goal."""
     result = handle.get_result_async()
     try:
         graph.spin_until(result.done)

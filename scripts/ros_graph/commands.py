@@ -1,4 +1,4 @@
-"""What the graph scripts share: the frame of their command line. Standard library only."""
+"""The common command line of the graph scripts. Standard library only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ INTERRUPTED = 130
 
 
 class GraphError(Exception):
-    """Something in the graph is not as the caller thinks. The message is one line."""
+    """Raised when the graph does not fit the request. The message is one line."""
 
 
 class Commands:
@@ -29,12 +29,12 @@ class Commands:
         self._verbs = self.parser.add_subparsers(required=True)
 
     def add(self, name: str, handler: str, about: str) -> argparse.ArgumentParser:
-        """A sub-command, for its arguments.
+        """Add a sub-command and return its parser, for its arguments.
 
         Args:
             name: on the command line.
-            handler: `module:function` in this package, which is imported inside the environment only; it takes a visit to the graph, and the arguments.
-            about: what it does.
+            handler: `module:function` in this package, imported inside the environment only; takes `Visit` and arguments.
+            about: its help text.
         """
         command = self._verbs.add_parser(name, help=about)
         command.set_defaults(handler=handler)
@@ -43,14 +43,14 @@ class Commands:
         return command
 
     def add_list(self, kind: str) -> None:
-        """The sub-command `list`, of `topics`, `services` or `actions`."""
+        """Add the sub-command `list`, of `topics`, `services` or `actions`."""
         command = self.add("list", "connection:list_names", f"the {kind} of the graph")
         command.set_defaults(kind=kind)
         command.add_argument("-t", "--show-types", action="store_true")
 
 
 def count(text: str) -> int:
-    """A number of messages on a command line: at least one."""
+    """Parse a number of messages, at least one."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not >= 1")
@@ -58,7 +58,7 @@ def count(text: str) -> int:
 
 
 def positive(text: str) -> float:
-    """A quantity on a command line that is neither zero, negative nor infinite."""
+    """Parse a positive, finite quantity."""
     value = float(text)
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a number > 0")

@@ -1,4 +1,4 @@
-"""A short visit to the ROS graph."""
+"""A short-lived connection to the ROS graph."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from ros_graph.commands import GraphError
 
 T = TypeVar("T")
 _SETTLED_S = 0.7
-"""Discovery counts as finished when nothing new has come for so long."""
+"""Discovery counts as finished when nothing new has appeared for this time [s]."""
 
 
 class Visit(GraphNode):
-    """A hidden node, and what is needed to wait for answers with it."""
+    """A hidden node, with methods to wait for answers."""
 
     def __init__(self) -> None:
         super().__init__(f"_perch_{time.time_ns() % 1_000_000_000}", interrupts=(signal.SIGINT, signal.SIGTERM))
 
     def answer(self, future: Future, what: str, timeout: float = 10.0) -> Any:
-        """The result of a future.
+        """Wait for the result of a future.
 
         Raises:
             GraphError: no answer in time.
@@ -38,7 +38,7 @@ class Visit(GraphNode):
         return future.result()
 
     def settle(self, observe: Callable[[], T], timeout: float) -> T:
-        """An observation of the graph, made once discovery brings nothing new any more."""
+        """Return an observation of the graph once it has settled, at the latest after `timeout` [s]."""
         seen, since = observe(), time.monotonic()
         end = since + timeout
 
@@ -53,7 +53,7 @@ class Visit(GraphNode):
         return seen
 
     def absolute(self, name: str) -> str:
-        """A name as the graph knows it."""
+        """Return a name as an absolute one."""
         return name if name.startswith("/") else f"/{name}"
 
 
@@ -63,12 +63,12 @@ def visit() -> AbstractContextManager[Visit]:
 
 
 def hidden(name: str) -> bool:
-    """Whether a part of a name begins with an underscore, which ROS keeps out of lists."""
+    """Return whether a name is hidden in lists: a part of it begins with an underscore."""
     return any(part.startswith("_") for part in name.split("/"))
 
 
 def list_names(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`list`: prints the names of a kind that are not hidden, with their types where that is asked for (`-t`)."""
+    """Run `list`: print the names of a kind that are not hidden, with their types if requested (`-t`)."""
     observe = {"topics": Node.get_topic_names_and_types, "services": Node.get_service_names_and_types,
                "actions": get_action_names_and_types}[arguments.kind]
     found = graph.settle(lambda: observe(graph.node), arguments.spin_time)

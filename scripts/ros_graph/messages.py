@@ -44,11 +44,11 @@ def interface(name: str, kind: str) -> type:
 
 
 def parse(text: str, what: str) -> dict[str, Any]:
-    """A mapping in YAML, as in `{armed: true}`; nothing for an empty text.
+    """Parse a mapping in YAML, as in `{armed: true}`; empty for an empty text.
 
     Raises:
-        ConfigError: not YAML.
-        GraphError: not a mapping.
+        ConfigError: the text is not YAML.
+        GraphError: the text is not a mapping.
     """
     values = parse_yaml(text, what) if text else {}
     if not isinstance(values or {}, dict):
@@ -63,7 +63,7 @@ def fill(message: Any, values: dict[str, Any], path: str = "") -> Any:
         The message.
 
     Raises:
-        GraphError: a field that does not exist, or a value that does not fit.
+        GraphError: a field does not exist, or a value does not fit.
     """
     types = message.get_fields_and_field_types()
     for name, value in values.items():
@@ -84,7 +84,7 @@ def fill(message: Any, values: dict[str, Any], path: str = "") -> Any:
 
 
 def _convert(type_name: str, present: Any, value: Any, here: str) -> Any:
-    """A value in the type of its field."""
+    """Convert a value to the type of its field."""
     if not ("[" in type_name or type_name.startswith("sequence")):
         return _scalar(type_name, value)
     if not isinstance(value, list):
@@ -120,7 +120,7 @@ def _scalar(type_name: str, value: Any) -> Any:
 
 
 def to_yaml(value: Any, arrays: bool = True) -> str:
-    """A message, or a value out of one, as YAML with a final newline; without `arrays` only their types."""
+    """Return a message, or a value of one, as YAML with a final newline; without `arrays` only type and length of arrays."""
     data = _plain(value, arrays)
     if not isinstance(data, (dict, list)):
         return f"{data}\n"
@@ -128,7 +128,7 @@ def to_yaml(value: Any, arrays: bool = True) -> str:
 
 
 def _plain(value: Any, arrays: bool, type_name: str = "") -> Any:
-    """A message as dictionaries, lists, numbers and strings; long ones are cut."""
+    """Convert a message to dictionaries, lists, numbers and strings; long lists and strings are truncated."""
     if hasattr(value, "get_fields_and_field_types"):
         return {name: _plain(getattr(value, name), arrays, kind) for name, kind in value.get_fields_and_field_types().items()}
     if isinstance(value, _SEQUENCES):

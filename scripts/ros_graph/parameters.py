@@ -1,4 +1,4 @@
-"""Reads and sets parameters of running nodes."""
+"""Sub-commands that read and set parameters of running nodes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TYPES = {getattr(ParameterType, f"PARAMETER_{kind.upper().replace(' ', '_')}"): 
 
 
 def list_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`param.py list`: of one node, or of all."""
+    """Run `param.py list`, of one node or of all."""
     nodes = [graph.absolute(arguments.node)] if arguments.node else _nodes(graph, arguments.spin_time)
     for node in nodes:
         names = _names(graph, _client(graph, node, arguments.spin_time), node)
@@ -29,7 +29,7 @@ def list_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def get_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`param.py get`"""
+    """Run `param.py get`."""
     node, client = _node(graph, arguments)
     value = _values(graph, client, node, [arguments.parameter])[0]
     if value.type == ParameterType.PARAMETER_NOT_SET:
@@ -40,7 +40,7 @@ def get_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def describe_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`param.py describe`: what each parameter means, its type and unit, and what is allowed."""
+    """Run `param.py describe`: print meaning, type, unit and allowed values of parameters."""
     node, client = _node(graph, arguments)
     names = [arguments.parameter] if arguments.parameter else _names(graph, client, node)
     values = _values(graph, client, node, names)
@@ -56,7 +56,7 @@ def describe_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def _allowed(descriptor: ParameterDescriptor) -> str:
-    """Type, range, unit and other limits of a parameter, and whether it can change."""
+    """Describe type, range, unit and other limits of a parameter, and whether it can change."""
     parts = [TYPES.get(descriptor.type, "of any type")]
     for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
         above = "> " in descriptor.additional_constraints  # an exclusive bound: the range begins with the next number
@@ -69,7 +69,7 @@ def _allowed(descriptor: ParameterDescriptor) -> str:
 
 
 def set_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`param.py set`: 1 where the node refuses the value."""
+    """Run `param.py set`: return 1 if the node refuses the value, otherwise 0."""
     value = parse_yaml(arguments.value, "value")
     node, client = _node(graph, arguments)
     name = arguments.parameter
@@ -91,7 +91,7 @@ def set_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def dump_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`param.py dump`: as a parameter file."""
+    """Run `param.py dump`: print the parameters as a parameter file."""
     node, client = _node(graph, arguments)
     names = _names(graph, client, node)
     values = _values(graph, client, node, names)
@@ -102,7 +102,7 @@ def dump_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def _node(graph: Visit, arguments: argparse.Namespace) -> tuple[str, AsyncParameterClient]:
-    """The node of the command line: its full name, and a client of its parameters."""
+    """Return the full name of the command line's node, and a client of its parameters."""
     name = graph.absolute(arguments.node)
     return name, _client(graph, name, arguments.spin_time)
 
@@ -130,5 +130,5 @@ def _values(graph: Visit, client: AsyncParameterClient, node: str, names: list[s
 
 
 def _plain(value: Any) -> Any:
-    """Arrays as lists, bytes as numbers."""
+    """Convert arrays to lists, bytes to numbers."""
     return list(value) if hasattr(value, "__len__") and not isinstance(value, str) else value

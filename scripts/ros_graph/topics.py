@@ -1,4 +1,4 @@
-"""What `topic.py` does: describes topics, prints, counts and publishes messages."""
+"""Sub-commands of `topic.py`: describe topics; print, count and publish messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REPORT_PERIOD = 1.0  # of `hz` [s]
 
 
 def show_info(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`topic.py info`"""
+    """Run `topic.py info`."""
     topic = graph.absolute(arguments.topic)
     name = topic_type(graph, topic, arguments.spin_time)
     sides = graph.settle(lambda: _sides(graph, topic), arguments.spin_time)
@@ -34,7 +34,7 @@ def show_info(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def echo(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`topic.py echo`"""
+    """Run `topic.py echo`."""
     wanted = 1 if arguments.once else arguments.n or math.inf
     shown = 0
     problem: list[Exception] = []
@@ -59,7 +59,7 @@ def echo(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def measure_rate(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`topic.py hz`: prints the rate every second; with `-n`, ends after so many messages."""
+    """Run `topic.py hz`: print the rate every second; with `-n`, end after that number of messages."""
     arrivals: deque[float] = deque(maxlen=max(arguments.window, 2))
     wanted, count, reported = arguments.n or math.inf, 0, 0
 
@@ -77,7 +77,7 @@ def measure_rate(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def rate_summary(arrivals: Sequence[float]) -> str:
-    """Rate and intervals in the words of `ros2 topic hz`.
+    """Describe rate and intervals in the format of `ros2 topic hz`.
 
     Args:
         arrivals: times of arrival [s], in order.
@@ -94,7 +94,7 @@ def rate_summary(arrivals: Sequence[float]) -> str:
 
 
 def publish(graph: Visit, arguments: argparse.Namespace) -> int:
-    """`topic.py pub`"""
+    """Run `topic.py pub`."""
     message = fill(interface(arguments.type, "msg")(), parse(arguments.values, "message"))
     topic = graph.absolute(arguments.topic)
     publisher = graph.node.create_publisher(type(message), topic, 10)
@@ -111,10 +111,10 @@ def publish(graph: Visit, arguments: argparse.Namespace) -> int:
 
 
 def topic_type(graph: Visit, topic: str, timeout: float) -> str:
-    """Name of a topic's type, as soon as somebody in the graph has the topic.
+    """Return the name of a topic's type, as soon as the topic exists in the graph.
 
     Raises:
-        GraphError: nobody has it, or there are several types.
+        GraphError: the topic does not appear in time, or has several types.
     """
     absolute = graph.absolute(topic)
     types = graph.spin_until(lambda: dict(graph.node.get_topic_names_and_types()).get(absolute), timeout)
@@ -127,7 +127,7 @@ def topic_type(graph: Visit, topic: str, timeout: float) -> str:
 
 
 def _subscribe(graph: Visit, arguments: argparse.Namespace, callback: Callable[[Any], None], raw: bool = False) -> None:
-    """Hear the topic of the command line, from all of its publishers; its type is the one given, or the one that the graph knows."""
+    """Subscribe to the topic of the command line with QoS compatible with its publishers; its type is given or from the graph."""
     cls = interface(arguments.type or topic_type(graph, arguments.topic, arguments.spin_time), "msg")
     topic = graph.absolute(arguments.topic)
     profiles = [endpoint.qos_profile for endpoint in graph.node.get_publishers_info_by_topic(topic)]

@@ -1,4 +1,4 @@
-"""Which trajectories may be flown: complete, finite, without jumps, beginning where the vehicle is."""
+"""Admission of trajectories: complete, finite, without jumps, beginning where the vehicle is."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STEP = 0.02            # largest step inside a trajectory [m]; ten times this f
 
 
 class TrajectoryRefused(PerchError):
-    """The trajectory is not flown; the message says why."""
+    """Raised when a trajectory is not flown; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Order:
         start: stamp of its start [s].
         at_end: what to do at the end.
         contact_time: how long a contact is awaited after the end [s].
-        recovery_start: time at which an appended recovery begins, negative: none [s].
+        recovery_start: time after the start at which an appended recovery begins, negative: none [s].
     """
 
     id: int
@@ -47,14 +47,14 @@ class Order:
 
 
 def check_order(order: TrajectoryOrder, vehicle: Vehicle) -> None:
-    """Refuse an order that makes no sense on any vehicle at any time, or would cost more than a control period to look at.
+    """Refuse an order that is invalid in any state of the vehicle, or too large to be checked within a control period.
 
     Args:
-        order: what to check.
-        vehicle: knows its greatest thrust.
+        order: the order.
+        vehicle: gives the greatest thrust.
 
     Raises:
-        TrajectoryRefused: with the value and what is allowed.
+        TrajectoryRefused: with the value and its limit.
     """
     trajectory, duration = order.trajectory, order.trajectory.duration
     if said := limits.problem(order):
@@ -68,7 +68,7 @@ def check_order(order: TrajectoryOrder, vehicle: Vehicle) -> None:
 
 
 def _check_polynomials(trajectory: FlatTrajectory) -> None:
-    """Refuse places, speeds and accelerations that nothing flies at."""
+    """Refuse positions, velocities and accelerations beyond their limits."""
     c, T = trajectory.coefficients, trajectory.durations[:, None, None]
     _check_size("position", c, limits.POSITION.high)
     rate = bernstein.derivative(c) / T if trajectory.degree else np.zeros(1)
@@ -78,7 +78,7 @@ def _check_polynomials(trajectory: FlatTrajectory) -> None:
 
 
 def _check_samples(trajectory: SampledTrajectory, vehicle: Vehicle) -> None:
-    """Refuse no attitudes, and thrusts that the vehicle does not have."""
+    """Refuse quaternions that are not of unit length, and rotor thrusts above twice the vehicle's greatest."""
     norms = np.linalg.norm(trajectory.q, axis=-1)
     if not np.abs(norms - 1.0).max() <= 1e-3:
         k = int(np.abs(norms - 1.0).argmax())
@@ -96,7 +96,7 @@ def check_joints(trajectory: FlatTrajectory | SampledTrajectory) -> None:
     """Refuse a trajectory that is not continuous in position and velocity.
 
     Raises:
-        TrajectoryRefused: with place and size of the step.
+        TrajectoryRefused: with time and size of the step.
     """
     if isinstance(trajectory, FlatTrajectory):
         c, T = trajectory.coefficients, trajectory.durations[:, None]
@@ -119,12 +119,12 @@ def check_joints(trajectory: FlatTrajectory | SampledTrajectory) -> None:
 
 
 def check_start(order: Order, now: float, present: Setpoint) -> None:
-    """Refuse a trajectory that does not begin where and when the vehicle is.
+    """Refuse a trajectory that does not begin near the present time, or not near the vehicle's position and velocity.
 
     Args:
-        order: what to check.
+        order: the order.
         now: time of the step [s].
-        present: where the vehicle will be at the start: the running reference there, or the state.
+        present: expected position and velocity at the start, from the running reference or the state.
 
     Raises:
         TrajectoryRefused: with the gap and its limit.

@@ -1,10 +1,10 @@
 """Rotor thrusts from a wanted wrench when rotors saturate: yaw is given up first, then thrust, tilt last.
 
 The rotor thrusts that give collective thrust T, tilt moment (Mx, My) and yaw moment Mz are affine in all of them,
-`f_i = a_i T + t_i(Mx, My) + d_i Mz`, and bounded, `lo_i <= f_i <= hi_i`. The tilt moments that can be had form a polygon
-whose edges are parallel to the rotors' levers (a zonogon); the one to have is the nearest point of it. Thrust and yaw are
+`f_i = a_i T + t_i(Mx, My) + d_i Mz`, and bounded, `lo_i <= f_i <= hi_i`. The attainable tilt moments form a polygon
+whose edges are parallel to the rotors' levers (a zonogon); its point nearest to the wanted moment is chosen. Thrust and yaw are
 nested linear programs in one unknown each: eliminating the unknowns of lower priority (Fourier-Motzkin) leaves finitely
-many linear bounds. So everything is solved exactly by comparing a few dozen numbers: no iteration, no sampling.
+many linear bounds. So the problem is solved exactly by comparing a few dozen numbers, without iteration or sampling.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _thrust_interval(lo, hi, offset, a, d):
 
 @compiled
 def _beyond(n, low, high, levers):
-    """How far the tilt moments that can be had reach along a direction `n`. [N m]"""
+    """Largest component of the attainable tilt moments along a direction `n`. [N m]"""
     total = 0.0
     for i in range(4):
         k = n[0] * levers[0][i] + n[1] * levers[1][i]
@@ -64,7 +64,7 @@ def _beyond(n, low, high, levers):
 
 @compiled
 def _tilt_share(wanted, floor, ceiling, levers):
-    """Largest share <= 1 of a tilt moment that rotors have which are free between two thrusts, equal for all."""
+    """Largest fraction <= 1 of a tilt moment that is attainable with every rotor thrust between `floor` and `ceiling`."""
     low, high = (floor, floor, floor, floor), (ceiling, ceiling, ceiling, ceiling)
     share = 1.0
     for i in range(4):
@@ -78,7 +78,7 @@ def _tilt_share(wanted, floor, ceiling, levers):
 
 @compiled
 def _nearest_tilt(wanted, lo, hi, levers):
-    """The tilt moment nearest to a wanted one that some rotor thrusts within their bounds have [N m], 2 floats."""
+    """Tilt moment nearest to the wanted one that is attainable with rotor thrusts within their bounds [N m], 2 floats."""
     inside, best, least = True, wanted, 1e300
     for i in range(4):
         length = (levers[0][i] ** 2 + levers[1][i] ** 2) ** 0.5
@@ -109,7 +109,7 @@ def _nearest_tilt(wanted, lo, hi, levers):
 
 @compiled
 def _nearest(value, low, high):
-    """The point of [low, high] nearest to a value; an interval that rounding has emptied counts as its middle."""
+    """The point of [low, high] nearest to a value; the middle where rounding has made the interval empty."""
     if low > high:
         return 0.5 * (low + high)
     return min(max(value, low), high)
@@ -125,13 +125,13 @@ def _sum(base, k, direction):
 def allocate(wrench, lo, hi, floor, ceiling, levers, mixing):
     """Rotor thrusts for a wanted wrench, by priority: tilt, then thrust, then yaw.
 
-    A tilt moment beyond what the rotors have at all is shortened in its direction; of the rest, the nearest that they can
-    reach now is had.
+    A tilt moment that is not attainable between `floor` and `ceiling` is shortened in its direction; then the nearest one that
+    is attainable between `lo` and `hi` is taken.
 
     Args:
         wrench: collective thrust [N] and moments Mx, My, Mz in B [N m], 4 floats.
         lo, hi: bounds of each rotor's thrust now [N], 4 floats each.
-        floor, ceiling: bounds of every rotor's thrust, given time [N].
+        floor, ceiling: bounds of every rotor's thrust in steady state [N].
         levers: moments Mx, My per thrust of each rotor [m], 2 x 4 floats.
         mixing: inverse of the allocation matrix by columns, ((a_i), (x_i), (y_i), (d_i)), 4 x 4 floats.
 

@@ -1,4 +1,4 @@
-"""The controller of a vehicle put together from its parameters: laws, augmentation and flight, and the choice among them."""
+"""Assembly of a vehicle's controller from its parameters: laws, augmentation and flight controller, and the choice of the law."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from perch_core.vehicle import Vehicle
 
 
 class LawNotReady(PerchError):
-    """The law is not there: it is being built, was not asked for, or could not be built."""
+    """Raised when a law is not available: it is still being built, or could not be built."""
 
 
 def build_law(name: str, vehicle: Vehicle, params: ControllerParameters) -> Law:
-    """A law by its name.
+    """Build a law by its name.
 
     Raises:
-        PerchError: it cannot be built.
+        PerchError: the law cannot be built.
     """
     return law_class(name).build(vehicle, params)
 
 
 class Assembly:
-    """Owns the laws.
+    """Owns the control laws and the flight controller.
 
     Attributes:
-        vehicle: as its file says.
-        flight: the flight controller, flying the law and the augmentation that the parameters name.
-        laws: those that are built, by name.
+        vehicle: the vehicle of the vehicle file.
+        flight: the flight controller, with the chosen law and augmentation.
+        laws: laws that have been built, by name.
     """
 
     def __init__(self, params: ControllerParameters, vehicle: Vehicle) -> None:
@@ -58,7 +58,7 @@ class Assembly:
         self._begin(choice.type, choice.adaptive)
 
     def restart(self) -> None:
-        """A new flight, on the ground, with the law that flies now."""
+        """Begin a new flight, disarmed, with the law in use."""
         self._begin(self.flown, self.flight.compensator is not None)
 
     def _begin(self, law: str, adaptive: bool) -> None:
@@ -67,17 +67,17 @@ class Assembly:
 
     @property
     def flown(self) -> str:
-        """Name of the law that flies."""
+        """Name of the law in use."""
         return next(name for name, law in self.laws.items() if law is self.flight.law)
 
     # -- laws --------------------------------------------------------------------------------------------------------
 
     def prepare_slow_laws(self, work: Callable[[Job], None], say: Callable[[str], None]) -> None:
-        """Build what takes long beside the flight.
+        """Build the slow laws in the background.
 
         Args:
-            work: takes the jobs.
-            say: told what could not be built.
+            work: runs a job in the background.
+            say: logs which law could not be built.
         """
         for name in LAWS:
             if name not in self.laws and law_class(name).slow:
@@ -106,11 +106,11 @@ class Assembly:
         self._show_lines(law)
 
     def choose(self, type: str, adaptive: bool) -> None:
-        """Fly a law, with or without L1, from the next step on.
+        """Use a law, with or without L1, from the next step on.
 
         Raises:
             ConfigError: there is no such law.
-            LawNotReady: it takes long to build, and has not been built.
+            LawNotReady: the law is slow to build, and has not been built.
         """
         if type not in self.laws:
             if law_class(type).slow:
@@ -124,10 +124,10 @@ class Assembly:
         flight.use(self.laws[type], self._params.gain_set, self._params.flight)
 
     def change(self, params: ControllerParameters) -> None:
-        """New gains and limits from the next step on; another law or augmentation where these differ.
+        """Use new gains and limits from the next step on, and another law or augmentation where these have changed.
 
         Raises:
-            ConfigError: one that is fixed after the start has changed, or the law is not ready; all stays as it was.
+            ConfigError: a parameter that is fixed after the start has changed, or the law is not ready; nothing is changed.
         """
         flight, old = self.flight, self._params
         choice, flown = params.controller, self.flown
@@ -149,22 +149,22 @@ class Assembly:
             again()
 
     def _absent(self, name: str) -> str:
-        """Why a law that takes long to build is not there."""
+        """Return why a slow law is not available."""
         return f"{name} could not be built: {self._failed[name][0]}" if name in self._failed else f"{name} is not ready: it is being built"
 
     # -- what is flown -----------------------------------------------------------------------------------------------
 
     def reference(self, trajectory: FlatTrajectory | SampledTrajectory) -> FlatReference | SampledReference:
-        """A trajectory as the laws take it."""
+        """Return a trajectory as a reference for the laws."""
         if isinstance(trajectory, FlatTrajectory):
             return FlatReference(trajectory)
         return SampledReference(with_unit_quaternions(trajectory), self.vehicle.mass)
 
     def order(self, order: TrajectoryOrder) -> Order:
-        """An order as the flight takes it.
+        """Check an order, and return it in the form of the flight controller.
 
         Raises:
-            TrajectoryRefused: it makes no sense.
+            TrajectoryRefused: the order is invalid.
         """
         check_order(order, self.vehicle)
         trajectory = order.trajectory
@@ -172,7 +172,7 @@ class Assembly:
                      float(order.recovery_start))
 
     def see(self, segments: Sequence[Segment]) -> None:
-        """The map of powerlines, for laws that look at them."""
+        """Pass the map of powerlines to the laws that use it."""
         self._segments = segments
         for law in self.laws.values():
             self._show_lines(law)

@@ -1,4 +1,4 @@
-"""The controller: odometry in, one command per sample out, of the kind that the vehicle takes; trajectories, commands, services."""
+"""Controller component: answers each odometry sample with a command to the vehicle; takes trajectories and commands."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ _WORDS = 200                      # characters of a reason that are passed on
 
 
 class Controller(Component[ControllerParameters]):
-    """Answers every odometry sample with a command to the vehicle; what is not as planned leads to a hover, a recovery or a descent.
+    """Answers every odometry sample with a command; a deviation from the plan leads to a hover, a recovery or a descent.
 
-    Silence: where odometry stops and the IMU goes on, IMU samples are answered by a descent without position; where both stop, the
-    watchdog goes on with it.
+    Loss of inputs: where odometry stops and the IMU continues, IMU samples are answered by a descent without position; where both
+    stop, the watchdog continues the descent.
 
     Attributes:
-        flight: the flight controller; a new one where time has begun anew.
+        flight: the flight controller; replaced where time has restarted.
     """
 
     config_type = ControllerParameters
@@ -65,7 +65,7 @@ class Controller(Component[ControllerParameters]):
     def __init__(self, config: ControllerParameters) -> None:
         """
         Raises:
-            ConfigError: there is no such vehicle, sensor file or law.
+            ConfigError: the vehicle, the sensor file or the law does not exist.
         """
         super().__init__(config)
         vehicle = load_vehicle(config.vehicle)
@@ -80,7 +80,7 @@ class Controller(Component[ControllerParameters]):
         self._begin()
 
     def _begin(self) -> None:
-        """A flight, and what is counted in it."""
+        """Begin a flight and reset its counters."""
         self.flight = self._assembly.flight
         self._answered: int | None = None  # newest stamp when odometry was last answered [ns]
         self._first: int | None = None     # stamp of the first answer [ns]
@@ -89,12 +89,12 @@ class Controller(Component[ControllerParameters]):
         self._silent = False               # a silence is being answered
 
     def warm_up(self) -> None:
-        """Load the compiled code, and build the laws that take long."""
+        """Load the compiled code, and start to build the slow laws in the background."""
         _dry_run_once(self.config)
         self._assembly.prepare_slow_laws(self.work, self.warn)
 
     def reconfigure(self, config: ControllerParameters) -> None:
-        """New gains and limits count from the next step."""
+        """Apply new gains and limits from the next step on."""
         for name in _FIXED:
             if getattr(config, name) != getattr(self.config, name):
                 raise ConfigError("", name, "is fixed after the start")
@@ -106,11 +106,11 @@ class Controller(Component[ControllerParameters]):
     # -- sensors -----------------------------------------------------------------------------------------------------
 
     def on_transform(self, transform: Transform) -> None:
-        """Where a frame, perhaps the IMU's, is in another."""
+        """Take the pose of a frame in another one; it may be that of the IMU."""
         self._axes.add_transform(transform)
 
     def on_imu(self, sample: ImuSample) -> None:
-        """Known to the flight; answered where odometry has stopped."""
+        """Pass a sample to the flight controller; answer it with a command where odometry has stopped."""
         taken = self._axes.in_body(sample)
         if taken is None or not self._believed(sample.stamp, "imu/data_raw"):
             return
@@ -122,7 +122,7 @@ class Controller(Component[ControllerParameters]):
             self._answer_silence(stamp, "odometry has stopped: the IMU is answered")
 
     def on_odometry(self, state: OdometryState) -> None:
-        """Answer a sample of the present in `map` with a motor command, whatever its values are worth."""
+        """Answer a sample in `map` with a current stamp by a command to the vehicle, even where its values are refused."""
         if state.frame != "map":
             self.warn(f"odometry: frame {state.frame!r} is not 'map': ignored", every=1.0)
             return
@@ -133,7 +133,7 @@ class Controller(Component[ControllerParameters]):
                                                    (state.pose_covariance, state.twist_covariance), problem(state)))
 
     def _believed(self, stamp: int, channel: str) -> bool:
-        """Whether a stamp is of the present; a time that has evidently begun anew is a new flight."""
+        """Whether a stamp is accepted. If time has restarted, a new flight begins; if it has jumped, the vehicle descends."""
         verdict = self._stamps.judge(stamp, may_restart=not self.flight.flown.flying or self._gone)
         if verdict is Stamp.PRESENT:
             self._spoke = True
@@ -155,7 +155,7 @@ class Controller(Component[ControllerParameters]):
     # -- silence -----------------------------------------------------------------------------------------------------
 
     def on_watchdog(self, now: int) -> None:
-        """Where nothing comes any more in flight, go on with the descent without position."""
+        """Descend without position where neither odometry nor IMU samples arrive in flight."""
         if self._spoke or self._spoken is None or now < self._spoken:
             self._spoke, self._spoken, self._gone = False, now, False
             return
@@ -173,7 +173,7 @@ class Controller(Component[ControllerParameters]):
     # -- orders ------------------------------------------------------------------------------------------------------
 
     def on_trajectory(self, order: TrajectoryOrder) -> None:
-        """Fly it from its start on, or say why not."""
+        """Follow a trajectory from its start on, or report why it is refused."""
         try:
             self.flight.follow(self._assembly.order(order))
         except PerchError as error:
@@ -181,7 +181,7 @@ class Controller(Component[ControllerParameters]):
             self.warn(self.flight.flown.message)
 
     def on_recovery(self, order: TrajectoryOrder) -> None:
-        """Keep a way out of the trajectory with the same id."""
+        """Keep a way out (a planned recovery) from the trajectory with the same id."""
         try:
             if (start := order.trajectory.start_time) > seconds(self._stamps.newest) + LONGEST_PLAN:
                 raise PerchError(f"it starts at {start:.1f} s, long after what is flown")
@@ -191,7 +191,7 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"way out of trajectory {order.id} refused: {error}")
 
     def on_command(self, command: ControllerCommand) -> None:
-        """Carry it out, or say why not. One that was given before this controller began, or long ago, is not meant for now."""
+        """Carry out a command, or report why it is refused. A command older than `STALE` is ignored."""
         if 0 < command.stamp < self._stamps.newest - STALE:
             self.warn(f"command {command.command} of {seconds(command.stamp):.3f} s is too old: ignored")
             return
@@ -204,7 +204,7 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"command: {error}")
 
     def on_powerlines(self, lines: PowerlineMap) -> None:
-        """Show the map to the laws that look at it. It is latched: an old one may be the newest there is, one of the future is nonsense."""
+        """Pass the map to the laws that use it. The topic is latched, so an old map is valid; one from the future is ignored."""
         newest = self._stamps.newest
         if self._stamps.begun and lines.stamp > newest + STALE:
             self.warn(f"powerlines: of {seconds(lines.stamp):.3f} s, which is to come ({seconds(newest):.3f} s): ignored", every=1.0)
@@ -217,7 +217,7 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"powerlines: {error}: ignored", every=1.0)
 
     def on_estimator(self, health: EstimatorHealth) -> None:
-        """An estimator that is not well ends what is flown."""
+        """Take the estimator's health; an estimator that has diverged or coasts for too long ends the running manoeuvre."""
         newest = self._stamps.newest
         if self._stamps.begun and abs(newest - health.stamp) > STALE:
             self.warn(f"estimator/status: of {seconds(health.stamp):.3f} s, not of the present ({seconds(newest):.3f} s): ignored", every=1.0)
@@ -227,7 +227,7 @@ class Controller(Component[ControllerParameters]):
     # -- services ----------------------------------------------------------------------------------------------------
 
     def on_set_controller(self, request: ChooseLaw, reply) -> None:
-        """Fly another law from the next step on."""
+        """Switch to another control law from the next step on."""
         try:
             self._assembly.choose(request.type, request.adaptive)
         except LawNotReady as error:
@@ -238,13 +238,13 @@ class Controller(Component[ControllerParameters]):
             reply(LawChosen(True, 0, f"{self.flight.law_name} flies"))
 
     def on_abort(self, request: Ask, reply) -> None:
-        """End in a hover."""
+        """End the running manoeuvre in a hover."""
         reply(Done(True, self.flight.abort()))
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 
     def _answer(self, stamp: int, result: StepResult) -> None:
-        """The command to the vehicle first; what people and the mission want to know at its own times, on one grid from the first answer on."""
+        """Emit the command to the vehicle first, then the periodic outputs, on one time grid from the first answer on."""
         loop = result.loop
         if loop is None:
             self.motor_command(MotorCommand(stamp, result.armed, result.rotor_speed))
@@ -262,7 +262,7 @@ class Controller(Component[ControllerParameters]):
             self._say(now, now - self._first, stamp, result)
 
     def _say(self, now: int, since: int, stamp: int, result: StepResult) -> None:
-        """What is due by now, `since` the first answer [ns]."""
+        """Emit the periodic outputs that are due; `since`: time since the first answer [ns]."""
         period = nanoseconds(self.config.controller.reference_period)
         if since >= self._statuses * STATUS_PERIOD:
             self._statuses = since // STATUS_PERIOD + 1
@@ -299,6 +299,6 @@ class Controller(Component[ControllerParameters]):
 
 @lru_cache(maxsize=4)
 def _dry_run_once(params: ControllerParameters) -> None:
-    """`dry_run`, once in a process: it loads what all controllers share."""
+    """Run `dry_run` once in a process: it loads the code that all controllers share."""
     vehicle = load_vehicle(params.vehicle)
     dry_run(vehicle, params.gain_set, params.flight)

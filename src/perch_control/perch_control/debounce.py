@@ -1,4 +1,4 @@
-"""Conditions that must hold for a while before anything acts on them."""
+"""Debounce: a condition must hold for some time before it takes effect."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 @dataclass
 class Debounce:
-    """A condition with memory: `update` is true from `hold` seconds of it on."""
+    """Debounced condition: `update` returns True once the condition has held for `hold` seconds."""
 
     hold: float
     since: float | None = None
 
     def update(self, condition: bool, now: float) -> bool:
-        """Take the condition at a time [s]."""
+        """Take the condition at a time [s]; return whether it has held for `hold` seconds."""
         if not condition:
             self.since = None
             return False

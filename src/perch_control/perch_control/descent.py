@@ -1,8 +1,8 @@
-"""Controlled descent without position: speed braked, thrust slightly under the weight, motors off when the ground is felt.
+"""Controlled descent without position: speed braked, thrust slightly below the weight, motors off on ground contact.
 
-The attitude comes from the gyroscope, corrected by the accelerometer while the vehicle flies steadily; the velocity from the
-last odometry and the accelerometer, with a leak: what it knows is what the vehicle had when odometry stopped, and that is
-braked, since a wall may be near.
+The attitude is integrated from the gyroscope, and corrected by the accelerometer while the specific force is near 1 g. The
+velocity is integrated from the last odometry with the accelerometer and a leak: it represents mainly the speed at the loss of
+odometry, which is braked, since a wall may be near.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _KNOWN_SPEED = 6.0  # faster is no velocity to be believed [m/s]
 
 @dataclass(frozen=True, slots=True)
 class AttitudeByImu:
-    """Attitude kept from gyroscope and accelerometer.
+    """Attitude estimated from gyroscope and accelerometer.
 
     Attributes:
         q: q_WB xyzw, 4 floats.
@@ -49,7 +49,7 @@ class AttitudeByImu:
 
         Args:
             gyro: angular velocity in B [rad/s].
-            accel: specific force in B [m/s^2]; its direction counts as vertical while its length is near 1 g.
+            accel: specific force in B [m/s^2]; its direction is taken as vertical while its magnitude is near 1 g.
             dt: time since the last sample [s].
         """
         n = sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2)
@@ -62,17 +62,17 @@ class AttitudeByImu:
 
 
 class BlindDescent:
-    """The descent itself; owns the attitude and decides when the ground is felt."""
+    """Controller of the descent; owns the attitude estimate and detects ground contact."""
 
     def __init__(self, vehicle: Vehicle, gains: ControlGains, q: tuple[float, ...], w: tuple[float, ...], seen: float, now: float,
                  v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
         """
         Args:
-            vehicle: with the thrust that it has shown in the air.
-            gains: of the attitude.
-            q, w, v: last attitude (xyzw), body rates [rad/s] and velocity in W [m/s] that could be trusted, zero where none could.
-            seen: their time [s].
-            now: time at which the descent begins to fly [s]; samples before it only tell the attitude and the velocity.
+            vehicle: model with the thrust observed in flight.
+            gains: attitude gains.
+            q, w, v: last trusted attitude (xyzw), body rates [rad/s] and velocity in W [m/s]; v is zero where it is not trusted.
+            seen: time of q, w and v [s].
+            now: time at which the descent begins [s]; earlier samples only update attitude and velocity.
         """
         self._gains, self._constants = gains, packed_vehicle(vehicle)
         self._mass = vehicle.mass
@@ -106,7 +106,7 @@ class BlindDescent:
         self.landed = self.landed or resting
 
     def _specific_thrust(self) -> tuple[float, float, float]:
-        """Wanted thrust per mass in W [m/s^2]: speed across is braked, a climb and a fall are bounded."""
+        """Wanted thrust per mass in W [m/s^2]: horizontal speed and climb are braked, the speed of the fall is bounded."""
         vx, vy, vz = self.v_W
         if self._touched is not None:  # held upright by the rotors until it has come to rest
             return 0.0, 0.0, _TOUCHED_SHARE * GRAVITY
@@ -116,7 +116,7 @@ class BlindDescent:
         return across[0], across[1], _SHARE * GRAVITY + fall - climb
 
     def wanted(self) -> tuple[float, float, float, float]:
-        """Collective thrust [N] and moments in B [N m]."""
+        """Wanted collective thrust [N] and moments in B [N m]."""
         q, w = self.attitude.q, self.attitude.w
         b1, b2, b3 = axes_of(q)
         f_W = self._specific_thrust()

@@ -1,7 +1,7 @@
-"""A flight before the flight, so that none of the compiled code is called for the first time in the air.
+"""Simulated flight before the real one, so that no compiled code is called for the first time in flight.
 
-A kernel is loaded from its cache by its first call, which takes milliseconds: those of a descent without position would all be loaded
-at the moment in which odometry has failed.
+The first call of a kernel loads it from its cache, which takes milliseconds. Otherwise, all kernels of a descent without
+position would be loaded at the moment at which odometry fails.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ _RISE = 1.0  # [s]
 
 
 class _DryRun:
-    """A controller whose vehicle is where it is expected to be."""
+    """A flight controller with ideal odometry: the vehicle is exactly where it is expected."""
 
     def __init__(self, flight: FlightController) -> None:
         self.flight, self.time = flight, 1.0
 
     def step(self, count: int = 3) -> None:
-        """Let periods pass."""
+        """Run a number of control periods."""
         for _ in range(count):
             self.time += NOMINAL_PERIOD
             p, v = self._expected()
@@ -38,11 +38,11 @@ class _DryRun:
             self.flight.step(self.time, (*p, *v, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
 
     def rise(self, id: int, end: float, at_end: AtEnd) -> None:
-        """Take a trajectory to a height [m]."""
+        """Follow a trajectory to the height `end` [m]."""
         self._follow(id, FlatReference(rest_to_rest(np.array(self._expected()[0]), np.array([0.0, 0.0, end]), 0.0, 0.0, _RISE)), at_end)
 
     def stay(self, id: int, at_end: AtEnd) -> None:
-        """Take a trajectory of full states that stays where the vehicle is."""
+        """Follow a trajectory of full states that stays at the expected position."""
         mass, still = self.flight.vehicle.mass, np.zeros((2, 3))
         path = SampledTrajectory(np.array([0.0, _RISE]), np.tile(self._expected()[0], (2, 1)), np.tile((0.0, 0.0, 0.0, 1.0), (2, 1)), still,
                                  still, still, still, np.full((2, 4), mass * GRAVITY / 4))
@@ -52,7 +52,7 @@ class _DryRun:
         self.flight.follow(Order(id, source, self.time + NOMINAL_PERIOD, at_end))
 
     def _expected(self) -> tuple[Vector, Vector]:
-        """Position [m] and velocity [m/s]; at rest on the ground before the first order."""
+        """Expected position [m] and velocity [m/s]; at rest at the origin while not flying."""
         if not self.flight.flown.flying:
             return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         at = self.flight.flown.expected(self.time)
@@ -60,10 +60,10 @@ class _DryRun:
 
 
 def dry_run(vehicle: Vehicle, gains: ControlGains, settings: FlightSettings) -> list[State]:
-    """Arm, rise, hover, begin a perch of either form of plan, recover, land, and descend without position, a few periods each.
+    """Arm, rise, hover, begin a perch with each type of plan, recover, land, and descend without position, a few periods each.
 
     Returns:
-        The states that it has been in.
+        The controller's states in the course of it.
     """
     flight = FlightController(vehicle, GeometricController(vehicle, gains), gains, settings)
     flight.compensator = L1Augmentation(vehicle)

@@ -1,4 +1,4 @@
-"""The controller without ROS: orders in, one `step` per odometry sample out, and the supervisor between them."""
+"""Flight controller without ROS: takes orders, and answers each odometry sample by a `step`, under a supervisor."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ _COASTING_LAND = 3.0         # the same: descend without position [s]
 
 
 class FlightController:
-    """Takes orders, judges odometry, supervises, and asks the control law for rotor commands.
+    """Takes orders, checks odometry, supervises the flight, and evaluates the control law.
 
     Attributes:
-        flown: the state of the flight; each input and each step makes the next one of it.
-        law, compensator: that fly; no compensator: without L1.
-        gains, settings: that count; `use` replaces them.
+        flown: state of the flight; each input and each step replaces it.
+        law, compensator: control law and L1 augmentation in use; compensator None: without L1.
+        gains, settings: gains and limits in use; `use` replaces them.
     """
 
     def __init__(self, vehicle: Vehicle, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
@@ -59,7 +59,7 @@ class FlightController:
         law.begin()
 
     def use(self, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
-        """Fly another law, or the same one with other gains and limits, from the next step on."""
+        """Use another law, or the same one with other gains and limits, from the next step on."""
         if law is not self.law:
             law.begin()
         self.law, self.gains, self.settings = law, gains, settings
@@ -70,32 +70,32 @@ class FlightController:
 
     @property
     def state(self) -> State:
-        """As published."""
+        """State of the controller, as published."""
         return self.flown.mode
 
     @property
     def vehicle(self) -> Vehicle:
-        """As it is believed to be."""
+        """The vehicle model in use."""
         return self.flown.vehicle
 
     @property
     def odometry_age(self) -> float:
-        """Of the last odometry sample that was accepted [s]."""
+        """Age of the last accepted odometry sample [s]."""
         return self._senses.age
 
     @property
     def health(self) -> RotorHealth:
-        """Of the rotors."""
+        """Health of the rotors."""
         return self._thrust.health
 
     @property
     def thrust_ratio(self) -> float:
-        """Thrust / mass that a perch would be flown with, over the vehicle file's."""
+        """Thrust / mass that would be used for a perch, over the vehicle file's."""
         return self._thrust.ratio(self.compensator)
 
     @property
     def law_name(self) -> str:
-        """Name of the control law that flies, `+l1` with the augmentation."""
+        """Name of the control law in use, with `+l1` where it is augmented."""
         return self.law.name + ("+l1" if self.compensator is not None else "")
 
     @property
@@ -109,7 +109,7 @@ class FlightController:
         """Carry out a command.
 
         Raises:
-            CommandRefused: it is not possible in the present state.
+            CommandRefused: the command is not possible in the present state.
         """
         self.flown = COMMANDS[command](self, self.flown, f": {reason}" if reason else "")
         if not self.flown.flying and command is not Command.ARM:
@@ -160,10 +160,10 @@ class FlightController:
         return entered(x, State.ARMED, "armed")._replace(start=x.now, rotors=x.rotors.turning(x.vehicle.speed_min), ground=x.belief[2])
 
     def follow(self, order: Order) -> None:
-        """Take a trajectory; it starts at its stamp and replaces the running one there.
+        """Accept a trajectory; it starts at its stamp and replaces the running one there.
 
         Raises:
-            TrajectoryRefused: it may not be flown.
+            TrajectoryRefused: the trajectory may not be flown.
         """
         x = self.flown
         if self.odometry_age > self.settings.odometry_timeout:
@@ -187,15 +187,15 @@ class FlightController:
         self._schedule.put(order)
 
     def keep_ready(self, order: Order) -> None:
-        """Keep a recovery that leaves the trajectory with the same id, for an abort before it starts. [P:V-B]
+        """Keep a recovery that leaves the trajectory with the same id, for an abort before that recovery's start. [P:V-B]
 
         Raises:
-            TrajectoryRefused: it may not be flown.
+            TrajectoryRefused: the recovery is not continuous.
         """
         self._schedule.keep_ready(self.flown, order)
 
     def abort(self, reason: str = "abort was requested") -> str:
-        """End whatever is flown in a hover, through a recovery where the vehicle is tilted. Returns what is done."""
+        """End the running manoeuvre in a hover, by a recovery where the vehicle is tilted. Returns a message on what is done."""
         x = self.flown
         if x.mode in (State.TRACKING, State.HOVERING):
             self.flown = self._left(x, reason)
@@ -205,18 +205,18 @@ class FlightController:
         return self.flown.message
 
     def _left(self, x: FlightState, reason: str) -> FlightState:
-        """End what is flown: by the next planned way out, or at once."""
+        """End the running manoeuvre: by the next planned way out, or at once."""
         return self._schedule.leave(x, reason) or self._stopped(x, reason)
 
     def _stopped(self, x: FlightState, reason: str) -> FlightState:
-        """Brake to a hover in which nothing waits to be flown; where that would touch the ground, land."""
+        """Discard pending trajectories and brake to a hover, or land where a hover would touch the ground."""
         self._schedule.drop()
         if x.low:
             return landing(x, f"landing: {reason}", self.settings.land_speed)
         return stopped(x, reason)
 
     def refused(self, message: str) -> None:
-        """Publish why an order was not taken."""
+        """Publish why an order was refused."""
         self.flown = self.flown._replace(message=message)
 
     # -- sensors -----------------------------------------------------------------------------------------------------
@@ -231,13 +231,13 @@ class FlightController:
             self.flown = self._given_up(self.flown, f"no VIO for {vio_age:.1f} s")
 
     def _given_up(self, x: FlightState, reason: str) -> FlightState:
-        """Leave a trajectory by a planned way out, or brake; where even the hardest brake would end in the surface, go on."""
+        """Leave a trajectory by a planned way out, or brake; continue where even the hardest brake would end in the surface."""
         if x.mode is not State.TRACKING:
             return x
         return self._schedule.leave(x, reason) or (x if committed(x) else self._stopped(x, f"hover: {reason}"))
 
     def descend(self, message: str, moving: bool = True) -> None:
-        """Descend without position from now on; `moving`: the velocity can be trusted."""
+        """Begin a descent without position; `moving`: whether the last velocity is trusted."""
         self.flown = self._descending(self.flown, message, moving)
 
     def _descending(self, x: FlightState, message: str, moving: bool = True) -> FlightState:
@@ -250,7 +250,7 @@ class FlightController:
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take an IMU sample; used in a descent without position, and kept for its beginning. Time [s], in B [rad/s, m/s^2].
 
-        Its time also shows that odometry with an old stamp is late.
+        Its stamp also reveals that odometry with an older stamp is late.
         """
         self._thrust.felt = accel[2]
         self.flown = self.supervisor.imu(self.flown, stamp, gyro, accel)
@@ -262,13 +262,13 @@ class FlightController:
 
     def step(self, stamp: float, sample: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None = None,
              problem: str = "") -> StepResult:
-        """Answer one odometry sample: always with a command, also when disarmed or when the sample is refused.
+        """Answer one odometry sample with a command, also while disarmed or where the sample is refused.
 
         Args:
-            stamp: of the sample [s].
+            stamp: stamp of the sample [s].
             sample: p_WB, v_WB (in W), q_WB (xyzw), w_WB_B, 13 floats.
-            covariances: its own, as `OdometryGate.check` takes them.
-            problem: why the sample is nonsense; empty: all its values are within their limits.
+            covariances: covariances of the sample, as in `OdometryGate.check`.
+            problem: why the sample is invalid; empty: all its values are within their limits.
         """
         if self._period.update(stamp):
             self.law.pace(self._period.value)
@@ -291,7 +291,7 @@ class FlightController:
         return self._answered(x)
 
     def step_blind(self, stamp: float) -> StepResult:
-        """Answer a step for which no odometry has come, from the IMU alone; without that nobody knows where up is for long."""
+        """Answer a step without odometry, from the IMU alone; without IMU samples for `DOWN_TIME`, the motors are stopped."""
         self._schedule.drop()
         x = self._senses.silence(self.flown, stamp)
         if x.flying and self._senses.imu_age(stamp) > DOWN_TIME:
@@ -299,7 +299,7 @@ class FlightController:
         return self._answered(self._descending(x, "no odometry"))
 
     def _answered(self, x: FlightState) -> StepResult:
-        """The command that follows from the state, and the state after it."""
+        """Return the command that follows from the state, and store the state after it."""
         x, result = self._descent(x, x.blind) if x.blind is not None else self._fly(x) if x.flying else self._idle(x)
         self.flown = x._replace(events=()) if x.events else x
         return result
@@ -321,7 +321,7 @@ class FlightController:
         return x, StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, margin, "; ".join(x.events), rotors.sent)
 
     def _compensation(self, x: FlightState, contact: float) -> tuple[float, ...]:
-        """What makes up for disturbances; only air may be taken for one, so not what the ground or a wall does."""
+        """Return the compensation of disturbances; forces of the ground or of a wall must not be estimated as disturbances."""
         if self.compensator is None:
             return NO_COMPENSATION
         if x.at_ground:
@@ -341,7 +341,7 @@ class FlightController:
 
     @property
     def _lying(self) -> State:
-        """What the state is on the ground, as the vehicle lies there."""
+        """State of the controller after a landing: FAILED where the vehicle lies tilted, else DISARMED."""
         return State.FAILED if self.supervisor.tilted else State.DISARMED
 
     def _idle(self, x: FlightState) -> tuple[FlightState, StepResult]:
@@ -355,7 +355,7 @@ class FlightController:
 
 
 def _check_flying(x: FlightState, name: str) -> None:
-    """Refuse a command that makes sense on a reference in flight only."""
+    """Refuse a command that requires a flight on a reference."""
     if not x.flying:
         raise CommandRefused(f"{name} is refused: not flying ({x.mode.name.lower()})")
     if x.blind is not None:
@@ -370,4 +370,4 @@ COMMANDS: dict[Command, Callable[[FlightController, FlightState, str], FlightSta
     Command.ATTACHED: FlightController._attach,
     Command.KILL: FlightController._kill,
 }
-"""What carries out each command: the state after it, from the present one and the reason."""
+"""Handler of each command: returns the next state from the present one and the reason."""

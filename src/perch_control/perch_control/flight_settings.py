@@ -10,7 +10,7 @@ from perch_core.config import quantity
 
 @dataclass(frozen=True)
 class FlightSettings:
-    """When the supervisor steps in, and how fast the vehicle lands."""
+    """Thresholds of the supervisor, and the landing speed."""
 
     fence_low: Vector3 = quantity((-20.0, -20.0, -5.0), unit="m", doc="geofence in map")
     fence_high: Vector3 = quantity((20.0, 20.0, 20.0), unit="m", doc="geofence in map")

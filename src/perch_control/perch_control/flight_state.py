@@ -1,4 +1,4 @@
-"""What holds between two steps of a flight, and what follows from it."""
+"""State of a flight between two steps, and the quantities that follow from it."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ _AWAY = 2.0           # radii of the body from the place of a contact at which n
 
 
 class FlightState(NamedTuple):
-    """A flight between two steps; every change makes a new one.
+    """State of a flight between two steps; every change creates a new object.
 
     Attributes:
-        vehicle: as it is believed to be; `weak`: its rotors give less than its file says.
+        vehicle: the vehicle model in use; `weak`: whether its rotors have less thrust than those of the vehicle file.
         mode, message: as published.
         source, start: running reference and the time at which it began [s].
-        order, trajectory_id: trajectory that is being tracked, or a planned way out of it while RECOVERING, else None; the id stays until
-            another one or the motors' stop.
-        meeting: when and where a surface or a wire is met [s, m].
-        attached_to: normal of the surface that carries the vehicle, None: none does.
-        blind: the descent without position that is under way.
-        ground: height at which the vehicle was armed [m]; `airborne`: it has been clear of it since.
-        lands: it was ordered to land, or was landing: a hover becomes a landing.
-        stops: what was flown has been left before its end: no perch goes on from the brake.
-        events: what has happened since the last step.
+        order, trajectory_id: the tracked trajectory, or the planned way out of it while RECOVERING, else None; the id is kept
+            until the next trajectory or until the motors stop.
+        meeting: time and position of the planned contact with a surface or a wire [s, m]; None: there is none.
+        attached_to: normal of the surface that carries the vehicle; None: there is none.
+        blind: the running descent without position; None: there is none.
+        ground: height at which the vehicle was armed [m]; `airborne`: whether it has been clear of the ground since.
+        lands: whether a landing was commanded or interrupted; a hover then becomes a landing.
+        stops: whether a trajectory was left before its end; no perch begins during the brake.
+        events: events since the last step, for the log.
         now: time of the step [s].
-        belief: state that is flown on, 13 floats: odometry, or its prediction while odometry is refused.
-        seen: stamp [s] and state of the last odometry sample that was accepted.
-        rotors: rotor speeds, or the inner loop, as the lag model has them.
+        belief: state used for control, 13 floats: odometry, or its prediction while odometry is refused.
+        seen: stamp [s] and state of the last accepted odometry sample.
+        rotors: estimate of the rotor speeds, or of the inner loop, by the lag model.
         margin: (max - commanded) / max of the most loaded rotor; `spare`: its mean in hover.
         position_error: distance to the reference [m].
     """
@@ -72,41 +72,41 @@ class FlightState(NamedTuple):
 
     @classmethod
     def disarmed(cls, vehicle: Vehicle) -> FlightState:
-        """A vehicle of which nothing is known but its file."""
+        """Return the initial state: a disarmed vehicle without any sensor data."""
         return cls(vehicle, False, State.DISARMED, "disarmed", Hold(Setpoint((0.0, 0.0, 0.0))), 0.0, None, 0, None, None, None, -inf, False, False, False, (),
                    0.0, (), (0.0, ()), stopped(vehicle), 1.0, 1.0, 0.0)
 
     def sensed(self, now: float, belief: tuple[float, ...], seen: tuple[float, tuple[float, ...]],
                rotors: RotorEstimate | InnerLoopEstimate) -> FlightState:
-        """As `_replace`, in less time: every step does it."""
+        """As `_replace`, but faster, since it is called in every step."""
         return FlightState._make(self[:-7] + (now, belief, seen, rotors) + self[-3:])
 
     def commanded(self, rotors: RotorEstimate | InnerLoopEstimate, margin: float, spare: float, position_error: float) -> FlightState:
-        """As `_replace`, in less time: every step does it."""
+        """As `_replace`, but faster, since it is called in every step."""
         return FlightState._make(self[:-4] + (rotors, margin, spare, position_error))
 
     @property
     def flying(self) -> bool:
-        """The motors carry the vehicle."""
+        """Whether the vehicle is in a mode of flight."""
         return self.mode in FLYING
 
     @property
     def at_ground(self) -> bool:
-        """The ground may carry the vehicle: it has not left it yet, or is on the way down to it."""
+        """Whether the ground may carry the vehicle: it is low, and has not been airborne or is neither tracking nor hovering."""
         return not (self.airborne and self.mode in (State.TRACKING, State.HOVERING)) and self.belief[2] - self.ground < AIRBORNE
 
     @property
     def low(self) -> bool:
-        """The ground on which it was armed is too near for a hover; what is further below is not on it."""
+        """Whether the vehicle is too close to the height at which it was armed for a hover, above or below it."""
         return abs(self.belief[2] - self.ground) < _LOW
 
     @property
     def braking(self) -> bool:
-        """To a hover, out of what was left before its end."""
+        """Whether the vehicle brakes to a hover from a trajectory that was left before its end."""
         return self.stops and self.elapsed < self.source.duration
 
     def takes(self, order: Order) -> bool:
-        """Whether a trajectory may begin: what was left before its end is braked to a hover, not flown on."""
+        """Whether a trajectory may begin: while `braking`, only one that ends in a hover."""
         return not self.braking or order.at_end is AtEnd.HOLD
 
     @property
@@ -115,18 +115,18 @@ class FlightState(NamedTuple):
         return self.now - self.start
 
     def setpoint(self, ahead: float = 0.0) -> Setpoint:
-        """The running reference `ahead` seconds from now."""
+        """Setpoint of the running reference `ahead` seconds from now."""
         return self.source.setpoint(self.now - self.start + ahead)
 
     def expected(self, time: float) -> Setpoint:
-        """Where the vehicle will be at a time [s]: on its reference in flight, where it is on the ground."""
+        """Expected setpoint at a time [s]: that of the reference while tracking or hovering, otherwise the present motion."""
         if self.mode in (State.TRACKING, State.HOVERING):
             return self.source.setpoint(time - self.start)
         return Setpoint(self.belief[0:3], self.belief[3:6])
 
     @property
     def specific_thrust_max(self) -> float:
-        """Greatest collective thrust / mass, as believed [m/s^2]."""
+        """Greatest collective thrust / mass of the vehicle model in use [m/s^2]."""
         return 4.0 * self.vehicle.thrust_max / self.vehicle.mass
 
     @property
@@ -137,16 +137,16 @@ class FlightState(NamedTuple):
         return max(self.order.source.duration - self.elapsed, 0.0)
 
     def may_touch(self, before: float) -> bool:
-        """Something else than air may act: a surface or a wire, from `before` seconds ahead of the planned meeting until the vehicle
-        is away from that place; also on the recovery from there, when what was given up holds all the same."""
+        """Whether a surface or a wire may act on the vehicle: from `before` seconds before the planned contact until the vehicle
+        is away from that place; also during the recovery from there, as an abandoned perch may hold after all."""
         if self.meeting is None or self.now < self.meeting[0] - before:
             return False
         return dist(self.meeting[1], self.belief[0:3]) < _AWAY * max(self.vehicle.body_radii)
 
     @property
     def stopping(self) -> tuple[float, float]:
-        """Longest duration T of a brake that ends before the surface that the trajectory leads to [s], infinite in the open; and the
-        deceleration [m/s^2]. v T / 2 + a T^2 / 10 is the room, with speed v and acceleration a towards the surface."""
+        """Longest duration T of a brake that ends before the surface that the trajectory leads to [s], infinite without one, and
+        its deceleration [m/s^2]. With speed v and acceleration a towards the surface, it covers v T / 2 + a T^2 / 10."""
         order = self.order
         if order is None or order.at_end is not AtEnd.CONTACT:
             return inf, 0.0
@@ -160,7 +160,7 @@ class FlightState(NamedTuple):
 
     @property
     def surface_normal(self) -> tuple[float, ...] | None:
-        """Outward normal of the surface that the trajectory is about to touch or has touched, None: in the open."""
+        """Outward normal of the surface that the trajectory is about to touch or has touched; None: there is none."""
         order = self.order
         if order is None or order.at_end is not AtEnd.CONTACT or self.elapsed < order.source.duration - _NEAR_CONTACT:
             return None

@@ -1,15 +1,15 @@
-"""An inner loop in front of the rotors: the vehicle takes body rates, or an attitude, with collective thrust, and follows with a lag.
+"""Inner loop in front of the rotors: the vehicle takes collective thrust with body rates or an attitude, and follows with a lag.
 
     w' = (rate_gain w_cmd - w) / rate_lag        T' = (thrust_gain T_cmd - T) / thrust_lag        on commands that are `delay` old
 
-The control laws ask for rotor speeds as always. What moment M and thrust T the rotors of the model have a period later, with their own
-lag and limits, is what the loop is asked for, by the inverse of its model; so it has no more to do than rotors can:
+The control laws command rotor speeds in this case, too. From these, the rotor model with its lag and limits predicts the moment M
+and thrust T one period later. The inverse of the loop's model turns them into a loop command that is feasible for the rotors:
 
     w_cmd = (w + rate_lag J^-1 (M - w x J w)) / rate_gain
     T_cmd = (T_now + (T - T_now) / (1 - exp(-period / thrust_lag))) / thrust_gain
-    q_cmd = q exp(attitude_lag (w_cmd - w_C)), for an attitude loop that asks for the rates w_C + error / attitude_lag
+    q_cmd = q exp(attitude_lag (w_cmd - w_C)), for an attitude loop that commands the rates w_C + error / attitude_lag
 
-all of it at the time at which the command acts. `InnerLoopEstimate` takes the place of `RotorEstimate`.
+All quantities are those at the time at which the command takes effect. `InnerLoopEstimate` takes the place of `RotorEstimate`.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ _AT_ONCE = 1e-6      # [s]
 
 
 class LoopCommand(NamedTuple):
-    """What is sent to an inner loop.
+    """Command to an inner loop.
 
     Attributes:
-        w_B: body rates [rad/s], 3 floats: to follow, or to feed forward where an attitude is taken.
+        w_B: body rates [rad/s], 3 floats: the command to a rate loop, or the feed-forward of an attitude loop.
         thrust: collective thrust / mass [m/s^2].
         q_WB: attitude xyzw, 4 floats.
     """
@@ -49,11 +49,11 @@ class LoopCommand(NamedTuple):
 
 
 class Later(NamedTuple):
-    """A running reference as it is when a command that is sent now acts; see `Following`.
+    """A running reference at the time at which a command sent at present takes effect; see `Following`.
 
     Attributes:
         running: the reference.
-        delay: [s].
+        delay: time from a command to its effect [s].
     """
 
     running: Following
@@ -61,12 +61,12 @@ class Later(NamedTuple):
 
     @property
     def source(self) -> Source:
-        """Of the reference."""
+        """Source of the reference."""
         return self.running.source
 
     @property
     def elapsed(self) -> float:
-        """Time since it began [s]."""
+        """Time since the start of the reference, at the end of the delay [s]."""
         return self.running.elapsed + self.delay
 
     def setpoint(self, ahead: float = 0.0) -> Setpoint:
@@ -76,14 +76,14 @@ class Later(NamedTuple):
 
 @compiled
 def loop_command(f, w, T_now, lags, share, vehicle):
-    """Rates and thrust that give the moment and the sum of rotor thrusts, by the inverse of the loop's model.
+    """Rates and thrust, before the loop's gains, that yield the moment and sum of rotor thrusts, by the loop's inverse model.
 
     Args:
         f: rotor thrusts [N], 4 floats.
         w: body rates [rad/s], 3 floats.
         T_now: collective thrust at the beginning of the period [N].
-        lags: of the rates [s], 3 floats.
-        share: of the way to its command that the thrust goes in a period.
+        lags: lags of the rates [s], 3 floats.
+        share: fraction of the way to its command that the thrust covers in a period.
         vehicle: constants (see `packed_vehicle`).
 
     Returns:
@@ -97,15 +97,15 @@ def loop_command(f, w, T_now, lags, share, vehicle):
 
 
 class InnerLoopEstimate(NamedTuple):
-    """Rotors behind an inner loop as the controller believes them to be. Used as `RotorEstimate` is.
+    """Estimate of the rotors behind an inner loop, with the interface of `RotorEstimate`.
 
     Attributes:
-        nominal: the vehicle as its file says.
-        led: the rotors when a command that is sent now acts: their lag model, run on what the laws have asked for.
-        speed: of the rotors now [rad/s], 4 floats.
-        coming: (time until they have it [s], speed) of the rotors between now and then.
-        thrust: collective that the loop has when a command that is sent now acts, by its own model and the file's thrust coefficient [N].
-        period: between commands [s].
+        nominal: the vehicle of the vehicle file.
+        led: rotors at the time at which a command sent at present takes effect, by their lag model and the laws' commands.
+        speed: present rotor speeds [rad/s], 4 floats.
+        coming: (time until then [s], rotor speeds) for the times between the present and that of `led`.
+        thrust: collective thrust of the loop at the time of `led`, by the loop's model and the file's thrust coefficient [N].
+        period: period of the commands [s].
         sent: the last command.
     """
 
@@ -119,27 +119,27 @@ class InnerLoopEstimate(NamedTuple):
 
     @property
     def delay(self) -> float:
-        """From a command to when it acts [s]."""
+        """Time from a command to its effect [s]."""
         return self.nominal.actuation.delay
 
     def turning(self, speed: float) -> InnerLoopEstimate:
-        """All rotors at one speed [rad/s]."""
+        """Return the estimate with all rotors at one speed [rad/s]."""
         thrust = 4.0 * self.nominal.thrust_coefficient * speed * speed
         return InnerLoopEstimate(self.nominal, self.led.turning(speed), (speed,) * 4, (), thrust, self.period)
 
     def after(self, duration: float, time_constant: float) -> InnerLoopEstimate:
-        """The same `duration` seconds later."""
+        """Return the estimate `duration` seconds later."""
         coming = tuple((left - duration, speed) for left, speed in self.coming)
         reached = sum(left < _AT_ONCE for left, _ in coming)
         return self._replace(led=self.led.after(duration, time_constant), speed=coming[reached - 1][1] if reached else self.speed,
                              coming=coming[reached:], period=duration if duration > 0.0 else self.period)
 
     def ahead(self, state: tuple[float, ...], vehicle: Vehicle) -> tuple[float, ...]:
-        """The state when a command that is sent now acts.
+        """Predict the state at which a command sent at present takes effect.
 
         Args:
-            state: now, 13 floats (see `Law.control`).
-            vehicle: as believed.
+            state: present state, 13 floats (see `Law.control`).
+            vehicle: the vehicle model in use.
         """
         if self.delay <= 0.0:
             return state
@@ -150,13 +150,13 @@ class InnerLoopEstimate(NamedTuple):
 
     def following(self, command: tuple[float, ...], state: tuple[float, ...], vehicle: Vehicle,
                   w_C: tuple[float, ...] = _ZERO) -> InnerLoopEstimate:
-        """The same with what makes the rotors follow commanded speeds.
+        """Return the estimate with the loop command that makes the rotors follow commanded speeds.
 
         Args:
             command: rotor speeds [rad/s], 4 floats.
-            state: when they begin to act, 13 floats.
-            vehicle: as believed.
-            w_C: rates that an attitude loop is to feed forward [rad/s].
+            state: state at which the command takes effect, 13 floats.
+            vehicle: the vehicle model in use.
+            w_C: feed-forward rates of an attitude loop [rad/s].
         """
         a, tau, nominal = vehicle.actuation, vehicle.motor_time_constant, self.nominal
         reached = approached(self.led.speed, command, 1.0 if tau <= 0.0 else 1.0 - exp(-self.period / tau))
@@ -173,6 +173,6 @@ class InnerLoopEstimate(NamedTuple):
 
 
 def stopped(vehicle: Vehicle) -> RotorEstimate | InnerLoopEstimate:
-    """What is believed of rotors, or of those behind an inner loop, that stand still."""
+    """Return the estimate of rotors at rest, behind an inner loop where the vehicle has one."""
     still = RotorEstimate(_REST, _REST)
     return still if vehicle.actuation.type == "rotor_speeds" else InnerLoopEstimate(vehicle, still)

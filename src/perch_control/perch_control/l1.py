@@ -1,11 +1,11 @@
-"""L1 adaptive augmentation: what acts on the vehicle besides its model is estimated and made up for. [P: ref. 24]
+"""L1 adaptive augmentation: disturbances that are not in the vehicle's model are estimated and compensated. [P: ref. 24]
 
 A predictor of velocity and body rates runs beside the vehicle. With piecewise-constant adaptation the disturbance is, at
 each sample, the one that would have caused the prediction error within the last period, times e^(-decay dt) (98 % of it at
-500 Hz, 90 % at 100 Hz); a low-pass filter separates the fast estimate from what is flown, and so sets the bandwidth (the "L1"
-filter), whatever the adaptation rate.
+500 Hz, 90 % at 100 Hz). A low-pass filter (the "L1" filter) separates the fast estimate from the compensation, and so sets the
+bandwidth independently of the adaptation rate.
 
-All on accelerations: force / mass in W [m/s^2], moment / inertia in B [rad/s^2].
+All quantities are accelerations: force / mass in W [m/s^2], moment / inertia in B [rad/s^2].
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def adapted(predicted, measured, filtered, decay, dt, bandwidth, bounds):
 
     Args:
         predicted, measured: velocity in W and body rates, 6 floats.
-        filtered: of the last sample, 6 floats.
+        filtered: filtered value of the last sample, 6 floats.
         decay: of the prediction error [1/s].
         dt: time since the last sample [s].
         bandwidth: of the filter [rad/s].
@@ -79,17 +79,17 @@ class L1Augmentation:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the disturbance: the vehicle is on the ground, or has left a surface."""
+        """Reset the disturbance and the predictor: the vehicle may be on the ground, or its model has changed."""
         self.disturbance = _ZERO
         self._last: tuple | None = None
 
     def believe(self, vehicle: Vehicle, explained: tuple[float, ...] | None = None) -> None:
-        """Another model of the vehicle.
+        """Use another model of the vehicle.
 
         Args:
             vehicle: the model.
-            explained: acceleration in W that it now explains [m/s^2], 3 floats: the rest of the estimate stays; None: what
-                was estimated against the last model is forgotten.
+            explained: acceleration in W that the new model explains [m/s^2], 3 floats: the rest of the estimate is kept; None:
+                the estimate is reset.
         """
         self._vehicle = packed_vehicle(vehicle)
         kept = self.disturbance
@@ -98,17 +98,17 @@ class L1Augmentation:
             self.disturbance = (*axpy(-1.0, explained, kept[0:3]), *kept[3:6])
 
     def hold(self) -> tuple[float, ...]:
-        """Compensation without adaptation, while something else than air acts on the vehicle."""
+        """Return the compensation without adaptation, while the vehicle may be in contact."""
         self._last = None
         return tuple(-x for x in self.disturbance)
 
     def update(self, state: tuple[float, ...], speed: tuple[float, ...], now: float) -> tuple[float, ...]:
-        """Take a state; returns what makes up for the disturbance, 6 floats (see `geometric_step`).
+        """Adapt to a state; returns the compensation of the disturbance, 6 floats (see `geometric_step`).
 
         Args:
             state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
-            speed: of the rotors now [rad/s], 4 floats.
-            now: [s].
+            speed: present rotor speeds [rad/s], 4 floats.
+            now: time of the state [s].
         """
         measured = (*state[3:6], *state[10:13])
         f = thrusts(speed, self._vehicle[1][0])

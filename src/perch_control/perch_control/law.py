@@ -1,4 +1,4 @@
-"""What a control law is: the base of all of them."""
+"""Base class of the control laws."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NO_COMPENSATION = (0.0,) * 6
 
 
 class ControlOutput(NamedTuple):
-    """What a controller answers in one period.
+    """Output of a control law for one period.
 
     Attributes:
         rotor_speed: commanded speeds [rad/s], 4 floats.
@@ -39,13 +39,13 @@ class ControlOutput(NamedTuple):
 class Law(ABC):
     """A control law: state and reference in, rotor commands out, once per odometry sample.
 
-    Only `control` must be written. The supervisor, the references and what is known of the rotors are the same for all laws.
+    Only `control` must be implemented. Supervisor, references and rotor estimate are the same for all laws.
 
     Attributes:
         name: as in the parameter `controller.type` and the service `set_controller`.
-        slow: building it takes seconds; it is built beside the flight.
-        vehicle: as believed.
-        period: of the odometry [s].
+        slow: whether building it takes seconds; it is then built in the background.
+        vehicle: the vehicle model in use.
+        period: period of the odometry [s].
     """
 
     name: ClassVar[str]
@@ -56,40 +56,40 @@ class Law(ABC):
 
     @classmethod
     def build(cls, vehicle: Vehicle, params: ControllerParameters) -> Law:
-        """The law for a vehicle, with the controller's parameters.
+        """Build the law for a vehicle, with the controller's parameters.
 
         Raises:
-            PerchError: it cannot be built with these.
+            PerchError: the law cannot be built with these.
         """
         return cls(vehicle)
 
     def retuned(self, params: ControllerParameters) -> Law | None:
-        """Take new parameters in flight: itself with these; None: it is to be built anew.
+        """Apply new parameters in flight; return the law with these, or None where it must be rebuilt.
 
         Raises:
-            ConfigError: one of them is fixed after the start; nothing has changed.
+            ConfigError: one of them is fixed after the start; the law is unchanged.
         """
         return None
 
     def begin(self) -> None:
-        """The law takes over: what it remembers of an earlier flight does not count."""
+        """Take over control: reset the internal state of an earlier use."""
 
     def believe(self, vehicle: Vehicle) -> None:
-        """Fly a vehicle whose thrust differs from what its file says."""
+        """Use a vehicle model whose thrust differs from that of the vehicle file."""
         self.vehicle = vehicle
 
     def pace(self, period: float) -> None:
-        """Odometry comes with another period [s] from now on."""
+        """Use another period of the odometry [s] from the next step on."""
         self.period = period
 
     def lines(self, lines: tuple[tuple[float, ...], ...]) -> None:
-        """Powerlines to look at and to keep away from: (centre, direction, half length, radius), 8 floats each, the watched one first."""
+        """Set the powerlines to avoid: (centre, direction, half length, radius), 8 floats each; the first is kept in view too."""
 
     def check_contact(self, source: Source) -> None:
         """Refuse a trajectory to a contact that this law cannot follow with this vehicle.
 
         Raises:
-            TrajectoryRefused: with how it would end.
+            TrajectoryRefused: with the predicted miss of the contact.
         """
 
     @abstractmethod
@@ -99,8 +99,8 @@ class Law(ABC):
 
         Args:
             state: p_WB [m], v_WB [m/s] in W, q_WB xyzw, w_WB_B [rad/s], 13 floats.
-            reference: the running reference; `reference.setpoint(ahead)` is what is wanted `ahead` seconds from now.
-            rotors: rotor speeds and what they are following.
-            compensation: acceleration in W and angular acceleration in B that make up for disturbances, 6 floats.
-            time_to_contact: to the planned contact [s], infinite where there is none.
+            reference: the running reference; `reference.setpoint(ahead)` is the setpoint `ahead` seconds from now.
+            rotors: rotor speeds and their commands.
+            compensation: acceleration in W and angular acceleration in B that compensate for disturbances, 6 floats.
+            time_to_contact: time to the planned contact [s], infinite where there is none.
         """

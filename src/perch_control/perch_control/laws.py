@@ -1,4 +1,4 @@
-"""The control laws that can be flown: name -> class. A law of your own is one more line; see docs/howto/own_controller.md."""
+"""Registry of the control laws: name -> class. Another law takes one more line; see docs/howto/own_controller.md."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ LAWS: dict[str, str] = {
 
 
 def check_law(name: str) -> None:
-    """
+    """Check the name of a law.
+
     Raises:
         ConfigError: there is no law with this name.
     """
@@ -26,7 +27,7 @@ def check_law(name: str) -> None:
 
 
 def law_class(name: str) -> type[Law]:
-    """The class of a law.
+    """Return the class of a law.
 
     Raises:
         ConfigError: there is no law with this name.

@@ -1,18 +1,18 @@
-"""The changes between the modes of a flight, each a function from one state to the next.
+"""Transitions between the modes of a flight, each a function from one state to the next.
 
 | manoeuvre | mode after it | reference | why |
 | --- | --- | --- | --- |
-| `tracked` | TRACKING, or RECOVERING by a planned way out | the trajectory | its start has come; it is left as planned |
+| `tracked` | TRACKING, or RECOVERING by a planned way out | the trajectory | its start time; a planned way out begins |
 | `stopped` | HOVERING; RECOVERING where tilted, turning or at a surface | a brake | its end, abort, HOVER, geofence, no VIO |
-| `stayed` | as `stopped`; RECOVERING stays | a hover where the vehicle believes to be | odometry has jumped and stays |
+| `stayed` | as `stopped`; RECOVERING stays | a hover at the new position | odometry has jumped permanently |
 | `recovered` | RECOVERING | guidance by the state | off the plan, contact missed, departure |
 | `settled` | HOVERING | a brake from the state | a recovery has come to rest |
-| `brought_down` | as `landing`; as `recovered` where `stopped` is | | LAND |
-| `landing` | LANDING | a brake into a descent | geofence, rotors at their limit, silence |
+| `brought_down` | as `landing`; RECOVERING where `stopped` recovers | as `landing` or `recovered` | LAND |
+| `landing` | LANDING | a brake into a descent | geofence, rotors at their limit, no order for too long |
 | `landing_weak` | LANDING | guidance by the state | weak rotors |
 | `descending` | LANDING, `blind` | none | no position |
-| `attached` | ATTACHED | none | the mission: the surface holds |
-| `motors_off` | DISARMED, FAILED | none | on the ground, killed, no sensor at all |
+| `attached` | ATTACHED | none | command of the mission: the surface holds the vehicle |
+| `motors_off` | DISARMED, FAILED | none | on the ground, killed, neither odometry nor IMU |
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 def entered(x: FlightState, mode: State, message: str) -> FlightState:
-    """Another mode, and why. A trajectory is kept while it is tracked, the place that it meets on the recovery from there, too."""
+    """Enter a mode, with the reason. The order is kept while TRACKING; the planned contact also while RECOVERING."""
     return x._replace(mode=mode, message=message, events=(*x.events, message), order=x.order if mode is State.TRACKING else None,
                       lands=x.lands and mode in (State.TRACKING, State.RECOVERING, State.HOVERING), stops=False,
                       meeting=x.meeting if mode in (State.TRACKING, State.RECOVERING) else None)
 
 
 def following(x: FlightState, source: Source) -> FlightState:
-    """A reference from now on."""
+    """Follow a reference from the present time on."""
     return x._replace(source=source, start=x.now)
 
 
 def tracked(x: FlightState, order: Order, source: Source, leaving: str = "") -> FlightState:
-    """Follow a trajectory, by the reference made from it; `leaving`: why it is flown, a planned way out."""
+    """Follow a trajectory by the reference made from it; `leaving`: why it is flown, if it is a planned way out."""
     x = (entered(x, State.RECOVERING, f"recovering as planned: {leaving}") if leaving else
          entered(x, State.TRACKING, f"tracking trajectory {order.id}"))
     met = {AtEnd.CONTACT: order.source.duration, AtEnd.RECOVER: order.recovery_start}.get(order.at_end, -1.0)
@@ -71,7 +71,7 @@ def attached(x: FlightState, message: str) -> FlightState:
 
 
 def stopped(x: FlightState, message: str) -> FlightState:
-    """Brake to a hover; out of a tilted attitude by way of a recovery."""
+    """Brake to a hover; by a recovery where the vehicle is tilted, turning, off the reference's tilt, or at a surface."""
     setpoint = x.setpoint()
     _, _, b3 = axes_of(x.belief[6:10])
     turning = b3[2] < _LEVEL or norm(x.belief[10:13]) > _TURNING
@@ -83,7 +83,7 @@ def stopped(x: FlightState, message: str) -> FlightState:
 
 
 def stayed(x: FlightState, message: str) -> FlightState:
-    """Hover where the vehicle now believes to be: what was followed no longer fits. A landing and a recovery go on from there."""
+    """Hover at the position after a jump of the odometry, as the reference is invalid. A landing or recovery is continued."""
     x = x._replace(lands=x.lands or x.mode is State.LANDING)
     if isinstance(x.source, Recovery):
         return entered(x, State.RECOVERING, f"recovering: {message}")._replace(source=x.source.moved(x.belief[0:3]))
@@ -104,20 +104,20 @@ def recovered(x: FlightState, message: str) -> FlightState:
 
 
 def landing(x: FlightState, message: str, speed: float) -> FlightState:
-    """Descend with a speed [m/s] until the ground is felt."""
+    """Descend with a speed [m/s] until ground contact."""
     setpoint = x.setpoint()
     p, v, a = _point_of_departure(x, setpoint)
     return following(entered(x, State.LANDING, message), brake(p, v, a, setpoint.h, (0.0, 0.0, -speed), x.stopping[0]))
 
 
 def brought_down(x: FlightState, message: str, speed: float) -> FlightState:
-    """Land with a speed [m/s]; where a hover would begin with a recovery, after that."""
+    """Land with a speed [m/s]; where a hover would begin with a recovery, land after it."""
     after = x if x.mode in (State.LANDING, State.RECOVERING) else stopped(x, message)
     return after._replace(message=message, lands=True) if after.mode is State.RECOVERING else landing(x, message, speed)
 
 
 def landing_weak(x: FlightState, message: str, speed: float) -> FlightState:
-    """Land at once, with what thrust there is, with a speed [m/s]."""
+    """Land at once with a speed [m/s], with the remaining thrust."""
     guidance = WeakLanding(speed, x.belief, x.ground)
     guidance.update(x.belief, x.specific_thrust_max)
     return following(entered(x, State.LANDING, f"landing on weak rotors: {message}"), guidance)
@@ -130,11 +130,11 @@ def descending(x: FlightState, message: str, vehicle: Vehicle, gains: ControlGai
     Args:
         x: state of the flight.
         message: why.
-        vehicle: with the thrust that it has shown in the air.
-        gains: of the attitude.
-        unseen: IMU samples since the last odometry that was accepted: time [s], rates [rad/s], specific force [m/s^2]. The descent
-            begins there: the prediction since then knows less than the IMU.
-        moving: the velocity can be trusted.
+        vehicle: model with the thrust observed in flight.
+        gains: attitude gains.
+        unseen: IMU samples since the last accepted odometry: time [s], rates [rad/s], specific force [m/s^2]. The descent starts
+            from that odometry, as the IMU is more accurate than the prediction since then.
+        moving: whether the last velocity is trusted.
     """
     stamp, sure = x.seen
     blind = BlindDescent(vehicle, gains, sure[6:10], sure[10:13], stamp, x.now, sure[3:6] if moving else _ZERO)
@@ -144,8 +144,8 @@ def descending(x: FlightState, message: str, vehicle: Vehicle, gains: ControlGai
 
 
 def _point_of_departure(x: FlightState, setpoint: Setpoint) -> tuple:
-    """Position, velocity and acceleration from which a manoeuvre goes on: without a jump of the reference where the
-    vehicle follows it, from the state where it does not."""
+    """Position, velocity and acceleration at which a manoeuvre starts: those of the reference where the vehicle follows it, so
+    that the reference does not jump; otherwise those of the state, without acceleration."""
     near = dist(setpoint.p, x.belief[0:3]) < _FOLLOWED
     if near and (x.order is not None or x.mode is State.HOVERING):
         return setpoint.p, setpoint.v, setpoint.a

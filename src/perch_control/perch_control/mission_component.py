@@ -1,4 +1,4 @@
-"""The mission: goals of the Perch action to trajectories and commands, decided at 50 Hz."""
+"""Mission component: executes goals of the Perch action by trajectories and commands, with decisions at 50 Hz."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ _ENDINGS = {Result.PERCHED: "succeeded", Result.CANCELLED: "cancelled"}
 
 @dataclass
 class _Running:
-    """A goal under way.
+    """A goal in progress.
 
     Attributes:
-        goal: as the host hands it over.
-        machine: flies it.
-        started: the machine has taken it.
-        waiting_since: the host's time since which it waits for odometry [ns].
-        pending: the query whose answer counts.
+        goal: as passed by the host.
+        machine: state machine that executes the goal.
+        started: whether the machine has been started.
+        waiting_since: host time since which the goal waits for odometry [ns].
+        pending: the latest request to the planner, until its answer is used.
         way_out: the same, for a way out of a perch on a surface.
     """
 
@@ -57,7 +57,7 @@ class _Running:
 
 
 class _Departing:
-    """A departure as the mission sees goals: its end answers the request."""
+    """A departure with the interface of a goal; its end answers the service request."""
 
     value, cancel_requested = PerchGoal(mode=Mode.POWERLINE), False  # the planner that is asked is that of wires
 
@@ -65,15 +65,15 @@ class _Departing:
         self._reply = reply
 
     def feedback(self, value: PerchFeedback) -> None:
-        """Nobody asked for it."""
+        """Do nothing: the service has no feedback."""
 
     def finish(self, ending: str, result: PerchResult) -> None:
-        """Answer."""
+        """Answer the request."""
         self._reply(Done(result.success, result.message))
 
 
 class Mission(Component[MissionParameters]):
-    """One goal at a time. Its time is the stamp of the newest odometry."""
+    """Executes one goal at a time. Its time is the stamp of the newest odometry."""
 
     config_type = MissionParameters
     changeable = ("mission.",)
@@ -98,7 +98,7 @@ class Mission(Component[MissionParameters]):
     def __init__(self, config: MissionParameters) -> None:
         """
         Raises:
-            ConfigError: there is no such sensor file.
+            ConfigError: the sensor file does not exist.
         """
         super().__init__(config)
         self._axes = ImuAxes(self.warn, config.sensors)
@@ -107,7 +107,7 @@ class Mission(Component[MissionParameters]):
         self._begin()
 
     def _begin(self) -> None:
-        """Nothing is known."""
+        """Reset all inputs, moves and requests."""
         self._stamps, self._imu_period = StampGuard(), MeasuredPeriod()
         self._moves = Moves(self.config.mission)  # home stays from goal to goal
         self._forces: deque[tuple[float, ...]] = deque(maxlen=IMU_MOST)
@@ -121,7 +121,7 @@ class Mission(Component[MissionParameters]):
         self._diagnosed: int | None = None
 
     def reconfigure(self, config: MissionParameters) -> None:
-        """New settings count from the next tick on."""
+        """Apply new settings from the next tick on."""
         self.config = config
         if self._running is not None:
             self._running.machine.reconfigure(config.mission)
@@ -129,7 +129,7 @@ class Mission(Component[MissionParameters]):
     # -- inputs ------------------------------------------------------------------------------------------------------
 
     def on_transform(self, transform: Transform) -> None:
-        """Where a frame, perhaps the IMU's, is in another."""
+        """Take the pose of a frame in another one; it may be that of the IMU."""
         self._axes.add_transform(transform)
 
     def on_imu(self, sample: ImuSample) -> None:
@@ -140,7 +140,7 @@ class Mission(Component[MissionParameters]):
             self._forces.append(taken.f_B)
 
     def on_odometry(self, state: OdometryState) -> None:
-        """Keep the newest."""
+        """Keep the newest odometry."""
         if state.frame != "map":
             self.warn(f"odometry: frame {state.frame!r} is not 'map': ignored", every=1.0)
         elif self._believed(state.stamp, "odometry") and (self._odometry is None or state.stamp > self._odometry.stamp):
@@ -181,7 +181,8 @@ class Mission(Component[MissionParameters]):
             self._estimator = health
 
     def _outdated(self, state: ControllerStatus | EstimatorHealth, kept: ControllerStatus | EstimatorHealth | None, channel: str) -> bool:
-        """What goes on while sensors are silent may be ahead of them, but not behind, nor overtaken; far ahead it keeps out no other."""
+        """Whether a message is older than the kept one, or more than `STALE` behind the sensors. It may be ahead of the sensors,
+        as it is published without them, too. A kept message that is ahead by more than `STALE` does not count."""
         overtaken = kept is not None and 0 < kept.stamp - state.stamp <= STALE
         if overtaken or state.stamp < self._stamps.newest - STALE:
             self.warn(f"{channel}: of {seconds(state.stamp):.3f} s, {'older than the one before' if overtaken else 'not of the present'}: ignored", every=1.0)
@@ -191,7 +192,7 @@ class Mission(Component[MissionParameters]):
     # -- ticks -------------------------------------------------------------------------------------------------------
 
     def on_tick(self, now: int) -> None:
-        """Decide, where there is odometry that is newer than at the last tick, or none at all for a while."""
+        """Decide where there is newer odometry than at the last tick, or where odometry has been silent for `SILENCE`."""
         if self._odometry is None:
             if self._running is not None:
                 self._wait_for_odometry(self._running, now)
@@ -267,7 +268,7 @@ class Mission(Component[MissionParameters]):
             self._finish(running, stamp, outputs.outcome)
 
     def _tell(self, running: _Running, stamp: int) -> None:
-        """The goal's feedback: at every change, and every `FEEDBACK_PERIOD`."""
+        """Publish the goal's feedback at every change, and every `FEEDBACK_PERIOD`."""
         machine = running.machine
         words = (machine.phase.value, machine.message)
         if words == self._told[1:] and stamp - self._told[0] < FEEDBACK_PERIOD:
@@ -286,21 +287,21 @@ class Mission(Component[MissionParameters]):
         return asked
 
     def on_plan_perch(self, plan: PerchPlan | Unavailable) -> None:
-        """Keep it until it counts."""
+        """Keep the answer until it is due."""
         self._asked["plan_perch"].answered(plan)
 
     def on_plan_way_out(self, plan: PerchPlan | Unavailable) -> None:
-        """Keep it until it counts."""
+        """Keep the answer until it is due."""
         self._asked["plan_way_out"].answered(plan)
 
     def on_plan_powerline(self, plan: PowerlinePlan | Unavailable) -> None:
-        """Keep it until it counts."""
+        """Keep the answer until it is due."""
         self._asked["plan_powerline"].answered(plan)
 
     # -- goals -------------------------------------------------------------------------------------------------------
 
     def on_perch(self, goal: Goal) -> str:
-        """Take a goal; one that cannot be flown ends at once, with its reason."""
+        """Accept a goal, or return why it is rejected; one that cannot be flown is aborted at once, with the reason."""
         if self._running is not None:
             self.warn("goal refused: another goal is being flown")
             return "another goal is being flown"
@@ -313,7 +314,7 @@ class Mission(Component[MissionParameters]):
         return ""
 
     def on_depart(self, request: Ask, reply: Callable[[Done], None]) -> None:
-        """Leave what carries the vehicle; answered when it hovers, or cannot."""
+        """Leave the surface or wire that carries the vehicle; answered once the vehicle hovers, or the departure has failed."""
         if self._running is not None:
             reply(Done(False, "a goal is being flown"))
         else:

@@ -1,4 +1,4 @@
-"""States, commands and events of the controller; the values are those of the messages."""
+"""States and commands of the controller, with the values of the messages, and the result of a control step."""
 
 from __future__ import annotations
 
@@ -38,21 +38,21 @@ FLYING = (State.TRACKING, State.HOVERING, State.RECOVERING, State.LANDING)
 
 
 class CommandRefused(PerchError):
-    """The command is not carried out; the message says why."""
+    """Raised when a command is not carried out; the message gives the reason."""
 
 
 class StepResult(NamedTuple):
-    """Answer to one step.
+    """Result of one control step.
 
     Attributes:
-        armed: motors run.
+        armed: whether the motors run.
         rotor_speed: commanded speeds [rad/s], 4 floats.
-        setpoint: reference at this step, None while the motors are off.
+        setpoint: reference at this step; None while the motors are off or idle, and in a descent without position.
         q_C, w_C, dw_C: commanded attitude (xyzw), body rates [rad/s], angular acceleration [rad/s^2].
         wrench: wanted thrust [N] and moments [N m], 4 floats.
         margin: (max - commanded) / max of the most loaded rotor.
-        event: something happened in this step that people should read; empty: nothing.
-        loop: command to the vehicle's inner loop, None: it has none and takes rotor speeds.
+        event: events of this step, for the log; empty: none.
+        loop: command to the vehicle's inner loop; None: the vehicle takes rotor speeds.
     """
 
     armed: bool

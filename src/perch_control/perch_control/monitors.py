@@ -1,4 +1,4 @@
-"""What the supervisor watches while motors run."""
+"""Monitors that the supervisor evaluates while the motors run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _QUIET = 0.5       # rates of what is carried [rad/s]
 
 
 def reference_tilt_deg(state: tuple[float, ...], setpoint: Setpoint) -> float:
-    """Angle between b3 and the reference's [deg], which is the direction of its thrust where it carries none; 0 in free fall then."""
+    """Angle between b3 and the reference's [deg], or its thrust direction where it has no b3; 0 in free fall then."""
     fx, fy, fz = setpoint.b3
     if hypot(fx, fy, fz) < 0.5:
         fx, fy, fz = setpoint.a[0], setpoint.a[1], setpoint.a[2] + GRAVITY
@@ -37,7 +37,7 @@ def reference_tilt_deg(state: tuple[float, ...], setpoint: Setpoint) -> float:
 
 @dataclass
 class TrackingMonitor:
-    """Tilt, body rate and position beyond what was planned, thrust margin, geofence."""
+    """Monitor of tilt, body rate and position against the plan, of the thrust margin and of the geofence."""
 
     settings: FlightSettings
     rate_max: float
@@ -51,7 +51,7 @@ class TrackingMonitor:
         self._margin = Debounce(_MARGIN_TIME)
 
     def deviation(self, state: tuple[float, ...], setpoint: Setpoint, now: float) -> str:
-        """What the vehicle does that was not planned; empty: nothing."""
+        """Return the deviation from the plan that has lasted too long; empty: none."""
         tilt = reference_tilt_deg(state, setpoint)
         rate = hypot(*state[10:13])
         error = dist(setpoint.p, state[0:3])
@@ -65,7 +65,7 @@ class TrackingMonitor:
         return f"{error:.2f} m away from the reference" if away else ""
 
     def exhausted(self, margin: float, now: float) -> bool:
-        """The rotors have been at their limit for too long."""
+        """Whether the rotors have been at their limit for too long."""
         return self._margin.update(margin < _MARGIN_LEAST, now)
 
     def outside(self, p: tuple[float, ...]) -> float:
@@ -76,15 +76,15 @@ class TrackingMonitor:
 
 
 class CarriedTilted:
-    """Something other than the rotors carries the vehicle, in an attitude in which it cannot hover; told from the IMU alone.
+    """Detects from the IMU alone that something other than the rotors carries the vehicle, at a tilt at which it cannot hover.
 
-    What the rotors do to the specific force points along b3. Where it has the length of gravity for long and does not point along
-    b3, a wall or the ground does it, whatever odometry says. The attitude need not be known, so that it holds in a descent without
-    position as well, and upside down after a fall.
+    The rotors act on the specific force along b3. Where its magnitude is that of gravity for a long time and it does not point
+    along b3, a wall or the ground carries the vehicle, whatever the odometry. No attitude is needed, so that this also works in a
+    descent without position, and upside down after a fall.
 
     Attributes:
-        tilted: what carries the vehicle does not push along b3.
-        lasts: it has done so for long.
+        tilted: whether the specific force does not point along b3.
+        lasts: whether the vehicle has been carried like this for `DOWN_TIME`.
     """
 
     def __init__(self) -> None:
@@ -104,6 +104,6 @@ class CarriedTilted:
 
 
 def _nearer(a: tuple[float, ...], b: tuple[float, ...], share: float) -> tuple[float, float, float]:
-    """A share of the way from one vector to another."""
+    """Return the point at a fraction of the way from one vector to another."""
     x, y, z = a
     return x + share * (b[0] - x), y + share * (b[1] - y), z + share * (b[2] - z)

@@ -1,4 +1,4 @@
-"""Which odometry may be flown on: in time order, and where the last one said the vehicle would be."""
+"""Gate for odometry: a sample must be in time order and consistent with the motion of the last accepted one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ _CONFIRM = 0.03        # a jump that stays so long, and is as certain as what wa
 
 
 class Verdict(NamedTuple):
-    """`usable`: fly on it. `jumped`: the first sample accepted after a jump. `reason`: why not, or what happened."""
+    """Verdict on a sample: whether it is `usable` for control, whether it `jumped` (the first one accepted after a jump), and the
+    `reason` of a refusal or the accepted jump."""
 
     usable: bool
     jumped: bool = False
@@ -26,7 +27,7 @@ class Verdict(NamedTuple):
 
 
 class OdometryGate:
-    """Owns the last accepted sample and a candidate that jumped away from it."""
+    """Owns the last accepted sample, and a candidate that has jumped away from it."""
 
     def __init__(self) -> None:
         self.stamp: float | None = None     # of the last accepted sample [s]
@@ -40,7 +41,7 @@ class OdometryGate:
         Args:
             stamp: [s].
             state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
-            covariances: of pose and twist as in `OdometryState`, shapes (6, 6); None: nothing is said, a jump is believed.
+            covariances: of pose and twist as in `OdometryState`, shapes (6, 6); None: unknown, a jump that lasts is accepted.
         """
         if self.stamp is None:
             return self._accept(stamp, state, covariances)
@@ -63,10 +64,10 @@ class OdometryGate:
         return Verdict(True, bool(jump), jump)
 
     def _doubt(self, covariances: tuple[np.ndarray, np.ndarray] | None) -> str:
-        """What the odometry itself no longer knows where it has jumped to; empty: it is there.
+        """Return which part of the state is too uncertain after a jump for the jump to be accepted; empty: none.
 
-        The covariance that has been added since the last accepted sample counts, as VIO's own grows without end: a step as large as the
-        1 sigma that comes with it is no measurement of one.
+        Only the covariance added since the last accepted sample counts, as that of VIO grows without bound. Where its 1 sigma
+        exceeds the limit of a jump, the new state is not a confirmed one.
         """
         if covariances is None:
             return ""
@@ -81,7 +82,7 @@ class OdometryGate:
         return ""
 
     def _step(self, t0: float, a: tuple[float, ...], t1: float, b: tuple[float, ...]) -> str:
-        """What is wrong with the step from one sample to the next; empty: nothing."""
+        """Return why the step from one sample to another is a jump; empty: it is none."""
         dt = t1 - t0
         dp, dv, turn, spun = _changes(a, b, dt)
         if dp > _POSITION_JUMP:
@@ -95,8 +96,8 @@ class OdometryGate:
 
 @compiled
 def _changes(a, b, dt):
-    """From state a to state b (13 floats), `dt` [s] later: what of the position the velocities leave unexplained [m], the velocity's
-    change [m/s], the turn, and how far the body rates go in that time [rad]."""
+    """Changes from state a to state b (13 floats), `dt` [s] later: the position change beyond that of the velocities [m], the
+    velocity change [m/s], the angle of the rotation, and the angle that the body rates explain [rad]."""
     dp, dv, c, wa, wb = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(3):
         dp += (b[i] - a[i] - 0.5 * dt * (a[3 + i] + b[3 + i])) ** 2

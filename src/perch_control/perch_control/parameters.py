@@ -17,7 +17,7 @@ from perch_core.vehicle import ControlGains, load_vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerChoice:
-    """Which control law flies."""
+    """Choice of the control law."""
 
     type: str = text("geometric", doc="control law, one of perch_control.laws (geometric, nmpc); service set_controller changes it, too")
     adaptive: bool = quantity(True, doc="L1 augmentation on force and moment")
@@ -29,14 +29,14 @@ class ControllerChoice:
 
 
 def _of_vehicle(name: str) -> Any:
-    """A parameter with unit and range of the vehicle file's gain, whose value it has where it is not set."""
+    """Return a parameter with unit and range of the vehicle file's gain; where it is not set, it has the vehicle file's value."""
     meta = next(item for item in fields(ControlGains) if item.name == name).metadata
     return field(default=None, metadata={**meta, "doc": f"{meta['doc']}; not set: the vehicle file's"})
 
 
 @dataclass(frozen=True, kw_only=True)
 class GainParameters:
-    """Gains in the place of the vehicle file's; see `ControlGains`."""
+    """Gains that replace those of the vehicle file; see `ControlGains`."""
 
     position: Vector3 | None = _of_vehicle("position")
     velocity: Vector3 | None = _of_vehicle("velocity")
@@ -47,7 +47,7 @@ class GainParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerParameters:
-    """Parameters of the node `controller`. Gains that are not set become those of the vehicle file, so that `ros2 param get` shows them."""
+    """Parameters of the node `controller`. Gains that are not set are filled in from the vehicle file, for `ros2 param get`."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
     sensors: str = text("", doc=IMU_AXES)
@@ -68,5 +68,5 @@ class ControllerParameters:
 
     @property
     def gain_set(self) -> ControlGains:
-        """The gains that are flown with."""
+        """The gains in use."""
         return ControlGains(**vars(self.gains))

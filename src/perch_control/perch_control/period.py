@@ -9,10 +9,10 @@ _SHORTEST, _LONGEST = 0.0005, 0.05
 
 
 class MeasuredPeriod:
-    """Period of a stream of samples: the nominal one until the median of 25 differences is another by a tenth.
+    """Period of a stream of samples: the nominal one until the median of 25 differences deviates by more than a tenth.
 
     Attributes:
-        value: [s].
+        value: the period [s].
     """
 
     def __init__(self) -> None:

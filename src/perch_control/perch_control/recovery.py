@@ -1,9 +1,9 @@
-"""The way back to a hover from any attitude: away from the surface, upright, then stop.
+"""Recovery to a hover from any attitude: push away from the surface, turn upright, then stop.
 
-After a missed perch the vehicle lies tilted beside the wall and falls. Turning upright moves the upper edge of its body
-towards the wall by its radius, so it pushes off first; then it turns with all the moment there is *and* with high thrust:
-as long as the thrust points away from the wall it makes room, and from half way up it brakes the fall. The commanded
-direction leads the present one by a bounded angle, which keeps most of the thrust while the moment is saturated.
+After a missed perch the vehicle is tilted beside the wall and falls. Turning upright moves the upper edge of its body
+towards the wall by its radius, so the vehicle pushes off first. It then turns with full moment *and* with high thrust:
+while the thrust points away from the wall, it increases the clearance; in the second half of the turn, it brakes the fall. The
+commanded direction leads the present one by a bounded angle, which keeps most of the thrust while the moment is saturated.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SPEED = 0.8           # ... and this speed, from which a brake follows the vehi
 
 
 def towards(f: Vector, b1: Vector, b3: Vector, ahead: float) -> Vector | None:
-    """The direction that is `ahead` [rad] from b3 on the shortest turn to `f`; None: `f` is nearer than that."""
+    """Return the direction at an angle `ahead` [rad] from b3 on the shortest turn to `f`; None: `f` is within that angle."""
     if dot(b3, f) >= cos(ahead) * norm(f):
         return None
     across: Vector = axpy(-dot(b3, f), b3, f)
@@ -43,18 +43,18 @@ def towards(f: Vector, b1: Vector, b3: Vector, ahead: float) -> Vector | None:
 
 
 class Recovery(ByState):
-    """Guidance from the present state; `update` first in each period, then `setpoint`.
+    """Guidance by the present state; in each period, `update` is called before `setpoint`.
 
     Attributes:
-        finished: the vehicle is upright and slow, and away from the surface.
+        finished: whether the vehicle is upright and slow, and away from the surface.
     """
 
     def __init__(self, specific_thrust_max: float, state: tuple[float, ...], normal: Vector | None) -> None:
         """
         Args:
             specific_thrust_max: greatest collective thrust / mass [m/s^2].
-            state: where the recovery begins, 13 floats (p, v, q, w).
-            normal: outward normal of the surface at `state`, None: in the open.
+            state: initial state, 13 floats (p, v, q, w).
+            normal: outward normal of the surface at `state`; None: there is none.
         """
         self._thrust_max = specific_thrust_max
         self._origin, self._normal = state[0:3], normal
@@ -64,7 +64,7 @@ class Recovery(ByState):
         self.finished = False
 
     def update(self, state: tuple[float, ...], elapsed: float) -> None:
-        """Take the present state, `elapsed` seconds after the beginning."""
+        """Compute the demand from the present state, `elapsed` seconds after the start."""
         p, v, w = state[0:3], state[3:6], state[10:13]
         b1, b2, b3 = axes_of(state[6:10])
         moved = axpy(-1.0, self._origin, p)
@@ -94,11 +94,11 @@ class Recovery(ByState):
                          and clearance >= 0.5 * _AWAY_DISTANCE)
 
     def moved(self, p: Vector) -> Recovery:
-        """The same one in odometry that has jumped to `p` [m]: clearance and lost height stay."""
+        """Return the recovery after a jump of the odometry to `p` [m]: clearance and lost height are kept."""
         after = copy(self)
         after._origin = axpy(1.0, p, axpy(-1.0, self._setpoint.p, self._origin))
         return after
 
     def setpoint(self, t: float) -> Setpoint:
-        """The demand of the last `update`: an acceleration without position or velocity error."""
+        """Return the demand of the last `update`: an acceleration with zero position and velocity error."""
         return self._setpoint

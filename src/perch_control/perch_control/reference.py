@@ -1,6 +1,6 @@
-"""What the vehicle shall do at a time: setpoints, and the sources that give them.
+"""Setpoints (the wanted motion at one time) and the reference sources that provide them.
 
-A source is anything with `duration` and `setpoint(t)`, t in seconds since its start.
+A source is any object with `duration` and `setpoint(t)`, t in seconds since its start.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class Setpoint(NamedTuple):
 
     Attributes:
         p, v, a, j, s: position and its derivatives [m, m/s, m/s^2, m/s^3, m/s^4].
-        h, dh, ddh: wanted direction of b2 (b2_des of [M:eq12]) and its derivatives. A vector, not an angle: a reference
-            attitude gives it without singularity, whatever the tilt.
-        b3, db3, ddb3: wanted direction of b3 and its derivatives; zero: that of the specific force a + g e3. A plan that
-            carries its attitude gives it also where there is hardly a force to tell it from.
+        h, dh, ddh: wanted direction of b2 (b2_des of [M:eq12]) and its derivatives. It is a vector instead of an angle, since
+            a reference attitude then determines it without singularity at any tilt.
+        b3, db3, ddb3: wanted direction of b3 and its derivatives; zero: that of the specific force a + g e3. A plan with
+            attitudes sets it, so that it is defined even where the force is close to zero.
     """
 
     p: Vector
@@ -55,7 +55,7 @@ class Setpoint(NamedTuple):
 
 @compiled
 def fields(row):
-    """The fields of a `Setpoint`, 11 vectors, of its packed form (33,)."""
+    """Return the fields of a `Setpoint`, 11 vectors, from its packed form (33,)."""
     return (
         (row[0], row[1], row[2]), (row[3], row[4], row[5]), (row[6], row[7], row[8]), (row[9], row[10], row[11]),
         (row[12], row[13], row[14]), (row[15], row[16], row[17]), (row[18], row[19], row[20]), (row[21], row[22], row[23]),
@@ -64,7 +64,7 @@ def fields(row):
 
 
 class Source(Protocol):
-    """A reference: setpoints over the time since its start, and how long it lasts [s]."""
+    """A reference: setpoints as a function of the time since its start, and its duration [s]."""
 
     @property
     def duration(self) -> float: ...
@@ -74,7 +74,7 @@ class Source(Protocol):
 
 
 class Following(Protocol):
-    """A running reference: its source, the time since it began, and its setpoint some time from now."""
+    """A running reference: its source, the time since its start [s], and its setpoint at a time ahead."""
 
     @property
     def source(self) -> Source: ...
@@ -87,32 +87,32 @@ class Following(Protocol):
 
 
 class ByState:
-    """A reference that is guidance by the state: a function of the state that it was given last, with nothing to be previewed."""
+    """A reference that is guidance by state: a function of the state in its last update, without preview."""
 
     duration = float("inf")
 
 
 class Resting:
-    """Hover at the origin: a reference for warming up."""
+    """Hover at the origin, as a running reference for the warm-up of a control law."""
 
     elapsed = 0.0
     duration = 0.0
 
     @property
     def source(self) -> Resting:
-        """Itself."""
+        """The reference itself."""
         return self
 
     def setpoint(self, ahead: float = 0.0) -> Setpoint:
-        """The same at every time."""
+        """Return the same setpoint at every time."""
         return Setpoint((0.0, 0.0, 0.0))
 
 
 @compiled
 def flat_setpoints(tables, edges, durations, choose, times, out):
-    """Setpoints of a flat trajectory (`FlatTrajectory.arrays`) at times [s], shape (n,): packed, in `out`, shape (n, 33).
+    """Write setpoints of a flat trajectory (`FlatTrajectory.arrays`) at times [s], shape (n,), to `out`, packed, shape (n, 33).
 
-    Past the end the last acceleration holds: a contact is being awaited there.
+    Past the end, the last acceleration is held, since a contact is awaited there.
     """
     last = len(durations) - 1
     for k in range(len(times)):
@@ -140,7 +140,7 @@ def flat_setpoints(tables, edges, durations, choose, times, out):
 
 @compiled
 def _flat_setpoint(tables, edges, durations, choose, t):
-    """`flat_setpoints` at one time [s], as `fields`: without arrays between here and the interpreter."""
+    """Return `flat_setpoints` at one time [s], in the form of `fields`: no array is passed to the interpreter."""
     times, out = np.empty(1), np.empty((1, 33))
     times[0] = t
     flat_setpoints(tables, edges, durations, choose, times, out)
@@ -149,13 +149,13 @@ def _flat_setpoint(tables, edges, durations, choose, t):
 
 @dataclass(frozen=True)
 class FlatReference:
-    """A polynomial in the flat outputs."""
+    """A reference given by a piecewise polynomial in the flat outputs."""
 
     trajectory: FlatTrajectory
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return self.trajectory.duration
 
     def many(self, times: np.ndarray) -> np.ndarray:
@@ -165,26 +165,26 @@ class FlatReference:
         return out
 
     def setpoint(self, t: float) -> Setpoint:
-        """Setpoint at a time [s]. Past the end the last acceleration holds: a contact is being awaited there."""
+        """Setpoint at a time [s]. Past the end, the last acceleration is held, since a contact is awaited there."""
         return Setpoint._make(_flat_setpoint(*self.trajectory.arrays, t))
 
 
 def with_unit_quaternions(trajectory: SampledTrajectory) -> SampledTrajectory:
-    """The same with unit quaternions where anybody's quaternions need it; what has been normalised stays as it is to the last bit."""
+    """Return the trajectory with unit quaternions; one that is normalised already is returned unchanged, bit by bit."""
     off = np.abs(np.linalg.norm(trajectory.q, axis=1) - 1.0).max()
     return trajectory if off < 1e-9 else trajectory.normalised()
 
 
 @compiled
 def _place(at, t):
-    """Index k of the sample before a time, and the share of the way to the next one."""
+    """Return the index k of the last sample before a time, and the fraction of the interval to the next one."""
     k = min(max(np.searchsorted(at, t, side="right") - 1, 0), len(at) - 2)
     return k, min(max((t - at[k]) / (at[k + 1] - at[k]), 0.0), 1.0)
 
 
 @compiled
 def _between(values, k, u):
-    """Linear between samples k and k + 1, shapes (n, 3) -> 3 floats."""
+    """Linear interpolation between samples k and k + 1, shapes (n, 3) -> 3 floats."""
     return axpy(1.0 - u, values[k], scale(u, values[k + 1]))
 
 
@@ -202,7 +202,7 @@ def _in_world(b1, b2, b3, c):
 
 @compiled
 def _sampled_setpoints(at, p, v, q, w, dw, specific, times, out):
-    """Setpoints of full states at the times `at` [s], shape (n,), at `times` [s], shape (m,): packed, in `out`, shape (m, 33).
+    """Write the setpoints of full states at `at` [s], shape (n,), for `times` [s], shape (m,), to `out`, packed, shape (m, 33).
 
     With f the specific collective thrust `specific` [m/s^2], shape (n,):
 
@@ -236,7 +236,7 @@ def _sampled_setpoints(at, p, v, q, w, dw, specific, times, out):
 
 @compiled
 def _sampled_setpoint(at, p, v, q, w, dw, specific, t):
-    """`_sampled_setpoints` at one time [s], as `fields`."""
+    """Return `_sampled_setpoints` at one time [s], in the form of `fields`."""
     times, out = np.empty(1), np.empty((1, 33))
     times[0] = t
     _sampled_setpoints(at, p, v, q, w, dw, specific, times, out)
@@ -245,15 +245,15 @@ def _sampled_setpoint(at, p, v, q, w, dw, specific, t):
 
 @dataclass(frozen=True)
 class SampledReference:
-    """Full states with rotor thrusts, brought to the same form: jerk and snap follow from the attitude's motion and the
-    collective thrust, b2_des and b3 from the reference attitude."""
+    """A reference given by full states with rotor thrusts. Jerk and snap follow from the attitude's motion and the
+    collective thrust; b2_des and b3 follow from the reference attitude."""
 
     trajectory: SampledTrajectory
     mass: float
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return self.trajectory.duration
 
     @cached_property
@@ -268,19 +268,19 @@ class SampledReference:
         return out
 
     def setpoint(self, t: float) -> Setpoint:
-        """Setpoint at a time [s]; past the end the last acceleration holds."""
+        """Setpoint at a time [s]; past the end, the last acceleration is held."""
         return Setpoint._make(_sampled_setpoint(*self._arrays, t))
 
 
 def peak_thrust(source, begin: float) -> float:
-    """Greatest specific thrust that a source asks for from a time on, to its end [m/s^2]; sampled every 40 ms."""
+    """Greatest specific thrust that a source demands between `begin` and its end [m/s^2]; sampled every 40 ms."""
     times = np.append(np.arange(begin, source.duration, 0.04), max(source.duration, begin))
     a = packed_many(source, times)[:, 6:9] + (0.0, 0.0, GRAVITY)
     return float(np.linalg.norm(a, axis=1).max())
 
 
 def packed_many(source, times: np.ndarray) -> np.ndarray:
-    """Setpoints of a source at many times [s], packed, shape (n, 33); sources that have `many` are evaluated in one go."""
+    """Setpoints of a source at many times [s], packed, shape (n, 33); a source with a method `many` is evaluated in one call."""
     if hasattr(source, "many"):
         return source.many(times)
     return np.array([source.setpoint(float(t)).packed for t in times])

@@ -1,8 +1,8 @@
-"""How strong the rotors are: the specific force felt along b3 against the thrust that their commands promise.
+"""Strength of the rotors: the measured specific force along b3 over the thrust predicted from their commands.
 
-In free air the accelerometer reads the thrust per mass. Both sides go through the same low-pass filter, so that a change
-of thrust alone leaves their ratio at 1; what is left is lost thrust, or a mass that is not the file's. A fast filter watches
-for rotors that fail in flight, a slow one knows the ratio well enough to plan with it.
+In free flight the accelerometer measures the thrust per mass. Both quantities pass the same low-pass filter, so that a change
+of thrust alone leaves their ratio at 1; a deviation means lost thrust, or a mass that differs from the file's. A fast filter
+detects rotors that fail in flight; a slow one is accurate enough for planning.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ HOVER_LEAST = 1.12     # greatest thrust / weight that is left, below which the 
 
 
 class RotorHealth:
-    """Owns the filter and the verdict.
+    """Owns the filters and the verdict on the rotors.
 
     Attributes:
-        ratio: felt / promised thrust, 1: as the vehicle's file says.
+        ratio: measured / predicted thrust; 1: as in the vehicle file.
         mean: the same over a longer time.
-        believed: what is flown with: 1 until the rotors are weak (then `ratio` in steps), or the mean was adopted.
-        weak: the rotors were found weak since they were started.
+        believed: the ratio used for control: 1 until the rotors are weak (then `ratio`, in steps), or until the mean is adopted.
+        weak: whether the rotors have been found weak since they were started.
     """
 
     def __init__(self, thrust_to_weight: float) -> None:
-        """`thrust_to_weight`: of the vehicle's file. Rotors are believed to just carry the weight even where they do not."""
+        """`thrust_to_weight`: of the vehicle file. `believed` is never less than what just carries the weight."""
         self._least = 1.001 / thrust_to_weight
         self.reset()
 
     def reset(self) -> None:
-        """Rotors as the vehicle's file says."""
+        """Reset to the rotors of the vehicle file."""
         self.ratio = self.mean = self.believed = 1.0
         self.weak = False
         self._felt = self._promised = self._mean_felt = self._mean_promised = GRAVITY
         self._low, self._last = Debounce(_WEAK_TIME), 0.0
 
     def pause(self, now: float) -> None:
-        """Something else than air acts on the vehicle, or it turns too fast: what is felt now says nothing."""
+        """Skip a sample that does not show the thrust: the vehicle may be in contact, or it turns too fast."""
         self._low.update(False, now)
         self._last = now
 
@@ -56,9 +56,9 @@ class RotorHealth:
         """Take a sample in free air.
 
         Args:
-            felt: specific force along b3 [m/s^2].
-            promised: thrust of the rotors' model per mass, with the file's thrust coefficient [m/s^2].
-            now: [s].
+            felt: measured specific force along b3 [m/s^2].
+            promised: predicted thrust per mass, from the rotor model with the file's thrust coefficient [m/s^2].
+            now: time of the sample [s].
 
         Returns:
             Whether `believed` has changed.
@@ -78,16 +78,16 @@ class RotorHealth:
 
     @property
     def shown(self) -> float:
-        """The mean, within what a sound vehicle may show."""
+        """The mean, limited to the plausible range."""
         return min(max(self.mean, self._least), _SHOWN_MOST)
 
     @property
     def adoptable(self) -> float:
-        """What `adopt` would believe."""
+        """The ratio that `adopt` would set."""
         return self.believed if self.weak else self._stepped(self.mean)
 
     def adopt(self) -> bool:
-        """Believe the mean from now on; returns whether that changes anything. Weak rotors are believed already."""
+        """Use the mean as `believed`; returns whether that changes it. With weak rotors, `believed` stays."""
         return self._believe(self.adoptable)
 
     def _believe(self, ratio: float) -> bool:

@@ -1,8 +1,8 @@
-"""Rotor speeds that follow their command with a first-order lag: prediction and the command that makes up for it.
+"""First-order lag of the rotor speeds: prediction, and the command that compensates for it.
 
-`d Omega / dt = (Omega_cmd - Omega) / tau`, thrust = k Omega^2. A command that aims past the wanted speed reaches it after
-`lead` seconds instead of several `tau`; what the rotor cannot reach in that time is known beforehand, so that the
-allocation can choose among the reachable thrusts.
+`d Omega / dt = (Omega_cmd - Omega) / tau`, thrust = k Omega^2. With a command beyond the wanted speed, the rotor reaches this
+speed after `lead` seconds instead of several `tau`. The thrusts that are reachable in that time are known in advance, so that
+the allocation can choose among them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from perch_core.vehicle import Vehicle
 
 @compiled
 def approached(speed, target, share):
-    """Speeds after the share `1 - exp(-t / tau)` of the way to their targets [rad/s], 4 floats."""
+    """Rotor speeds after the fraction `share` = `1 - exp(-t / tau)` of the way to their targets [rad/s], 4 floats."""
     return (
         speed[0] + share * (target[0] - speed[0]), speed[1] + share * (target[1] - speed[1]),
         speed[2] + share * (target[2] - speed[2]), speed[3] + share * (target[3] - speed[3]),
@@ -25,7 +25,7 @@ def approached(speed, target, share):
 
 @compiled
 def thrusts(speed, coefficient):
-    """Thrusts of rotor speeds [rad/s] -> [N], 4 floats."""
+    """Rotor thrusts [N] from rotor speeds [rad/s], 4 floats each."""
     return (coefficient * speed[0] * speed[0], coefficient * speed[1] * speed[1],
             coefficient * speed[2] * speed[2], coefficient * speed[3] * speed[3])
 
@@ -34,7 +34,7 @@ def thrusts(speed, coefficient):
 def reachable(speed, share, speed_min, speed_max):
     """Lowest and highest speeds that the rotors can have after the lead time [rad/s], 4 floats each.
 
-    A rotor outside its limits (off, or starting) is taken as being at the limit.
+    Both are clipped to the limits, also for a rotor that is outside them (off, or starting).
     """
     low = approached(speed, (speed_min, speed_min, speed_min, speed_min), share)
     high = approached(speed, (speed_max, speed_max, speed_max, speed_max), share)
@@ -45,7 +45,7 @@ def reachable(speed, share, speed_min, speed_max):
 
 @compiled
 def leading_command(speed, thrust, coefficient, share, speed_min, speed_max):
-    """Commands with which the rotors have the wanted thrusts after the lead time, within their limits [rad/s], 4 floats."""
+    """Commands with which the rotors reach the wanted thrusts after the lead time, within their limits [rad/s], 4 floats."""
     a, b, c, d = thrust
     k = 1.0 / coefficient
     return (
@@ -57,10 +57,10 @@ def leading_command(speed, thrust, coefficient, share, speed_min, speed_max):
 
 
 def lag_behind(time_constant: float, lead: float, period: float) -> float:
-    """How late rotors follow wanted speeds that change steadily, where every period brings a new `leading_command` [s].
+    """Delay with which rotors follow steadily changing wanted speeds, with a new `leading_command` in every period [s].
 
-    Such rotors go the share a = (1 - exp(-period / tau)) / (1 - exp(-lead / tau)) of the way in each period, and are period / a behind:
-    less than `lead`, which is when they would get there if the command stayed.
+    In each period the rotors cover the fraction a = (1 - exp(-period / tau)) / (1 - exp(-lead / tau)) of the way, so that they
+    lag by period / a. This is less than `lead`, after which they would arrive if the command stayed constant.
     """
     if time_constant <= 0.0:
         return period
@@ -68,11 +68,11 @@ def lag_behind(time_constant: float, lead: float, period: float) -> float:
 
 
 class RotorEstimate(NamedTuple):
-    """Rotor speeds as the controller believes them to be: the lag model run on its own commands, or the measured ones.
+    """Estimate of the rotor speeds, from the lag model and the controller's own commands, or from measurements.
 
     Attributes:
-        speed: [rad/s], 4 floats.
-        command: what the rotors are following [rad/s], 4 floats.
+        speed: present speeds [rad/s], 4 floats.
+        command: speeds that the rotors are approaching [rad/s], 4 floats.
     """
 
     speed: tuple[float, ...]
@@ -94,24 +94,24 @@ class RotorEstimate(NamedTuple):
         return RotorEstimate(self.speed, command)
 
     def turning(self, speed: float) -> RotorEstimate:
-        """All at one speed [rad/s]."""
+        """Return rotors that all turn at one speed [rad/s]."""
         return RotorEstimate((speed,) * 4, (speed,) * 4)
 
     def ahead(self, state: tuple[float, ...], vehicle: Vehicle) -> tuple[float, ...]:
-        """The state when a command that is sent now acts: at once."""
+        """Return the state at which a command sent at present takes effect: the present one, as there is no delay."""
         return state
 
     @property
     def led(self) -> RotorEstimate:
-        """The rotors when a command that is sent now acts: at once."""
+        """Return the rotors at which a command sent at present takes effect: the present ones, as there is no delay."""
         return self
 
     @property
     def delay(self) -> float:
-        """From a command to when it acts [s]."""
+        """Time from a command to its effect [s]."""
         return 0.0
 
     @property
     def sent(self) -> None:
-        """The command to an inner loop: rotors have none."""
+        """Command to an inner loop; None, since the rotors are commanded directly."""
         return None

@@ -1,4 +1,4 @@
-"""Trajectories that wait for their start: the next one, and the ways out of the running one."""
+"""Trajectories that wait for their start: the next one, and the ways out (planned recoveries) of the running one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LEAVE_TIME = 0.6  # an abort flies on for at most so long, to where a planned r
 
 
 class Schedule:
-    """Owns what is pending; starts it when its time has come."""
+    """Owns the pending trajectories, and starts each at its start time."""
 
     def __init__(self) -> None:
         self._pending: tuple[Order, str] | None = None  # a trajectory, and why it is a way out
@@ -25,36 +25,36 @@ class Schedule:
 
     @property
     def waiting(self) -> bool:
-        """Whether a trajectory is to follow."""
+        """Whether a trajectory is pending."""
         return self._pending is not None
 
     def leaving(self, x: FlightState) -> bool:
-        """Whether a way out is to follow."""
+        """Whether the running trajectory is about to be left by a way out."""
         return self._pending is not None and bool(self._pending[1]) or bool(self._left_for(x))
 
     def put(self, order: Order) -> None:
-        """The next trajectory."""
+        """Set the next trajectory."""
         self._pending = order, ""
 
     def drop(self) -> None:
-        """Nothing is to follow."""
+        """Discard the pending trajectory, and a way out that was to be taken."""
         self._pending = self._last = None
 
     def keep_ready(self, x: FlightState, order: Order) -> None:
-        """Keep a recovery that leaves the trajectory with the same id, for an abort before it starts. [P:V-B]
+        """Keep a recovery that leaves the trajectory with the same id, for an abort before that recovery's start. [P:V-B]
 
         Raises:
-            TrajectoryRefused: it may not be flown.
+            TrajectoryRefused: the recovery is not continuous.
         """
         check_joints(order.source.trajectory)
         known = (x.trajectory_id, order.id)  # the next trajectory has ways out before it is flown
         self._ways_out = [o for o in self._ways_out if o.id in known and o.start >= x.now][-_MOST:] + [order]
 
     def leave(self, x: FlightState, reason: str) -> FlightState | None:
-        """Leave a trajectory by the next way out that was planned of it; None where none is near.
+        """Leave the running trajectory by its next planned way out; return None where none starts soon.
 
-        Until that recovery starts the trajectory is flown on, for `_LEAVE_TIME` at most: braking out of a tilted attitude at
-        speed needs more room than a planned way out.
+        The trajectory is continued until that recovery starts, for `_LEAVE_TIME` at most: braking out of a tilted attitude at
+        speed needs more space than a planned way out.
         """
         order = x.order
         if order is None or (order.recovery_start < 0.0 and order.at_end is not AtEnd.CONTACT):
@@ -73,7 +73,7 @@ class Schedule:
         return x._replace(message=f"{reason}; planned recovery in {start - x.now:.2f} s")
 
     def activated(self, x: FlightState) -> FlightState:
-        """Start the pending trajectory when its time has come, or the recovery that was planned for this vehicle at the wire."""
+        """Start the pending trajectory at its start time; without one, switch to the recovery from the wire where this is due."""
         if self._pending is None:
             return self._left_as_planned(x)
         order, leaving = self._pending
@@ -93,14 +93,14 @@ class Schedule:
         return x
 
     def _left_for(self, x: FlightState) -> str:
-        """Why the running trajectory is left by its appended recovery; empty: it is not."""
+        """Return why the running trajectory is left by its appended recovery; empty: it is not."""
         return self._last[1] if self._last is not None and self._last[0] is x.order else ""
 
     def _left_as_planned(self, x: FlightState) -> FlightState:
-        """Where the appended recovery is due, take the one that is kept ready for then: it begins where the vehicle is by now.
+        """When the appended recovery is due, switch to a recovery kept for that time, if it is near the vehicle.
 
-        Nothing is blended: the reference comes to the vehicle, and the way from there is clear of the wire. Without one the trajectory
-        goes on; where it is being left, that is a recovery.
+        It is not blended: it was planned from the vehicle's expected state, and its path is clear of the wire. Without one, the
+        trajectory continues; where it is being left, the mode becomes RECOVERING.
         """
         order = x.order
         if order is None or order.recovery_start < 0.0:

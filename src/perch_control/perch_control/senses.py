@@ -1,4 +1,4 @@
-"""What odometry and IMU have said: the state that is flown on, and what has been felt since the last odometry."""
+"""Sensor inputs of a flight: the state used for control, and the IMU samples since the last odometry."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from perch_control.rotor_lag import thrusts
 from perch_control.smooth_position import SmoothPosition
 
 QUIET = 1.0
-"""Refusals of samples are events at most this often [s]: of two nodes that publish odometry, every other sample is refused."""
+"""Shortest time between two logged refusals of samples [s]: with two publishers of odometry, every other sample is refused."""
 
 
 class Senses:
-    """Owns the gate of the odometry.
+    """Owns the odometry gate.
 
     Attributes:
-        age: of the last odometry sample that was accepted [s].
+        age: age of the last accepted odometry sample [s].
         refused: why the last sample was refused; empty: it was accepted.
-        unseen: IMU samples since the odometry that was accepted last: time [s], rates [rad/s], specific force [m/s^2].
+        unseen: IMU samples since the last accepted odometry: time [s], rates [rad/s], specific force [m/s^2].
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Senses:
         self._gate, self._smooth = OdometryGate(), SmoothPosition()
 
     def imu_age(self, now: float) -> float:
-        """Of the last IMU sample at a time [s], in s; infinite before the first."""
+        """Age of the last IMU sample at a time [s], in s; infinite before the first one."""
         return now - self._imu_stamp
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...], keep: bool) -> None:
@@ -46,7 +46,7 @@ class Senses:
 
     def odometry(self, x: FlightState, stamp: float, sample: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None,
                  problem: str) -> tuple[FlightState, Verdict]:
-        """The state by a sample, or predicted where it is refused, and the verdict on it; arguments as of `FlightController.step`."""
+        """Return the state from a sample, or predicted, and the verdict on it; arguments as in `FlightController.step`."""
         verdict = Verdict(False, reason=f"odometry: {problem}") if problem else self._gate.check(stamp, sample, covariances)
         # Odometry that repeats itself does not stop the time.
         x = self._believed(x, stamp if stamp > x.now else max(x.now, self._imu_stamp), verdict, sample)
@@ -54,13 +54,13 @@ class Senses:
         return x, verdict
 
     def silence(self, x: FlightState, now: float) -> FlightState:
-        """The state at a time [s] for which no odometry has come."""
+        """Return the state at a time [s] for which there is no odometry."""
         dt, rotors = _later(x, now)
         self.age += dt
         return x.sensed(now, x.belief, x.seen, rotors)
 
     def _believed(self, x: FlightState, now: float, verdict: Verdict, sample: tuple[float, ...]) -> FlightState:
-        """The state at a time [s], with a sample that is usable, or predicted."""
+        """Return the state at a time [s], from a usable sample or predicted."""
         dt, rotors = _later(x, now)
         if verdict.usable:
             self.refused = ""
@@ -78,6 +78,6 @@ class Senses:
 
 
 def _later(x: FlightState, now: float) -> tuple:
-    """Time that has passed until `now` [s], at most 0.1 s, and the rotors then."""
+    """Return the time elapsed until `now` [s], at most 0.1 s, and the rotors at its end."""
     dt = min(max(now - x.now, 0.0), 0.1)
     return dt, x.rotors.after(dt, x.vehicle.motor_time_constant)

@@ -1,8 +1,9 @@
-"""The last tenths of a second before a wire, on the velocity: what odometry corrects its position by is not flown after.
+"""Position from the integrated velocity around the contact with a wire: position corrections of the odometry are left out there.
 
-VIO corrects its position by centimetres per image while the vehicle turns over. The vehicle does not move by that, and the wire as
-it was seen last does not either: a controller that follows leaves the wire by as much, and turns away from it to do so. A plan no
-longer moves with the map then; from there on the position is the one at that time and the integral of the velocity.
+VIO corrects its position by centimetres per image while the vehicle turns over. Neither the vehicle nor the last estimate of
+the wire moves by that: a controller that followed the corrections would miss the wire by as much, and turn away from it to do
+so. From `BEFORE` the contact on, when the mission stops shifting its plan with the map, the velocity is integrated from the
+last position.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _ZERO = (0.0, 0.0, 0.0)
 
 
 class SmoothPosition:
-    """Owns the corrections that are left out on the running trajectory; other trajectories are flown on the odometry as it is."""
+    """Owns the corrections that are left out on a trajectory to a wire; on other trajectories, the odometry is used unchanged."""
 
     def __init__(self) -> None:
         self._order: Order | None = None
@@ -25,12 +26,12 @@ class SmoothPosition:
         self._left_out = _ZERO
 
     def of(self, time: float, sample: tuple[float, ...], order: Order | None) -> tuple[float, ...]:
-        """The state to fly on.
+        """Return the state used for control.
 
         Args:
             time: stamp of the sample [s].
             sample: odometry: p_WB, v_WB (in W), q_WB (xyzw), w_WB_B, 13 floats.
-            order: the trajectory that is tracked, None: none is.
+            order: the tracked trajectory; None: there is none.
         """
         (before, last), self._last = self._last, (time, sample)
         if order is None or order.at_end is not AtEnd.RECOVER or order.recovery_start < 0.0:

@@ -1,4 +1,4 @@
-"""Which stamps belong to the present: those of IMU and odometry together, so that one wrong sender cannot move the time."""
+"""Check of stamps against the present time, for IMU and odometry together, so that one faulty publisher cannot shift the time."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class StampGuard:
     """Owns the newest stamp of several streams of the same clock.
 
     Attributes:
-        newest: the newest stamp that was believed [ns], 0 where none was.
-        begun: one was.
+        newest: the newest accepted stamp [ns], 0 without one.
+        begun: whether a stamp has been accepted.
     """
 
     def __init__(self) -> None:
@@ -31,11 +31,11 @@ class StampGuard:
         self._first = self._last = -1  # of stamps that are away from the newest, with nothing else between them
 
     def judge(self, stamp: int, may_restart: bool = True) -> Stamp:
-        """Take a stamp [ns], of any of the streams.
+        """Check a stamp [ns] of any of the streams.
 
         Args:
-            stamp: in the order of arrival; a little older than the newest is of the present, too.
-            may_restart: time may begin anew; otherwise stamps of the past are refused however many there are.
+            stamp: stamps are passed in the order of arrival; one slightly older than the newest is accepted, too.
+            may_restart: whether time may restart; otherwise stamps of the past are always refused.
         """
         newest = self.newest
         if not self.begun or -_JUMP <= stamp - newest <= _AHEAD:

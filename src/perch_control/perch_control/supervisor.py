@@ -1,4 +1,4 @@
-"""The supervisor: what is not as planned leads to a hover, a recovery or a descent, always with the reason said."""
+"""Supervisor: a deviation from the plan leads to a hover, a recovery or a descent, always with a reported reason."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _UPRIGHT = 0.7       # cosine of the tilt beyond which a recovery or a perch goe
 
 
 def committed(x: FlightState) -> bool:
-    """Even the hardest brake would end in the surface that the trajectory leads to: contact is the shorter way to rest."""
+    """Whether even the hardest brake would end in the surface ahead, so that the contact is the shorter way to rest."""
     return x.stopping[1] > BRAKE_HARD
 
 
 class Supervisor:
-    """Watches a flight, by its mode, and says how it goes on. Owns the monitors, which start anew with each mode.
+    """Monitors a flight and changes its mode where necessary. Owns the monitors, which restart with each mode.
 
     Attributes:
-        settings: its limits; `restart` after a change.
+        settings: limits; `restart` is called after a change.
     """
 
     def __init__(self, vehicle: Vehicle, settings: FlightSettings) -> None:
@@ -47,20 +47,20 @@ class Supervisor:
         self.restart(State.DISARMED)
 
     def restart(self, mode: State) -> None:
-        """Forget what has been seen so far: the mode or the settings have changed."""
+        """Reset the monitors after a change of the mode or of the settings."""
         self._mode = mode
         self._monitor = TrackingMonitor(self.settings, self._rate_max)
         self._ground = Debounce(_GROUND_TIME)
 
     def wanted(self, x: FlightState) -> Setpoint:
-        """The running reference now; supervisor and step ask for the same one, which is worked out once."""
+        """Present setpoint of the running reference; cached, as supervisor and control step use the same one."""
         source, t = x.source, x.now - x.start
         if self._wanted[0] is not source or self._wanted[1] != t or isinstance(source, ByState):
             self._wanted = source, t, source.setpoint(t)
         return self._wanted[2]
 
     def imu(self, x: FlightState, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> FlightState:
-        """Take an IMU sample: time [s], in B [rad/s, m/s^2]. Running motors that only press the vehicle onto something are stopped."""
+        """Take an IMU sample: time [s], in B [rad/s, m/s^2]. Motors that only press the vehicle onto an obstacle are stopped."""
         if not x.flying:
             self._carried = None
             return x
@@ -73,11 +73,11 @@ class Supervisor:
 
     @property
     def tilted(self) -> bool:
-        """What carries the vehicle, by the IMU, does not push along b3."""
+        """Whether the specific force, by the IMU, does not point along b3."""
         return self._carried is not None and self._carried.tilted
 
     def act(self, x: FlightState) -> FlightState:
-        """Watch one step of a flight, and how it goes on."""
+        """Monitor one step of a flight; return the state, in another mode where necessary."""
         if x.mode is not self._mode:
             self.restart(x.mode)
         if x.weak and not isinstance(x.source, WeakLanding) and (asked := self._beyond_what_is_left(x)):
@@ -137,7 +137,7 @@ class Supervisor:
         return x
 
     def _beyond_what_is_left(self, x: FlightState) -> str:
-        """Why weak rotors cannot go on with what is flown; empty: they can."""
+        """Return why weak rotors cannot continue the running manoeuvre; empty: they can."""
         left = x.specific_thrust_max
         said = f"at most {100.0 * left / GRAVITY:.0f} % of the weight is left"
         upright = axes_of(x.belief[6:10])[2][2] >= _UPRIGHT
@@ -152,7 +152,7 @@ class Supervisor:
         return said if left < HOVER_LEAST * GRAVITY else ""
 
     def landed(self, x: FlightState, setpoint: Setpoint) -> bool:
-        """The reference has descended away from under the vehicle for a while: the ground carries it."""
+        """Whether the ground carries the vehicle: for some time it has not followed the descent."""
         if x.mode is not State.LANDING:
             return False
         if isinstance(x.source, WeakLanding):
@@ -168,4 +168,4 @@ WATCH: dict[State, Callable[[Supervisor, FlightState], FlightState]] = {
     State.RECOVERING: Supervisor._recovering,
     State.LANDING: Supervisor._landing,
 }
-"""How each mode of flight is watched."""
+"""Monitoring function of each mode of flight."""

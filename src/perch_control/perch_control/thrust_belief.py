@@ -1,4 +1,4 @@
-"""Which vehicle is flown: the one of the file, with the thrust that it has shown in the air."""
+"""Vehicle model used in flight: that of the vehicle file, with the thrust observed in flight."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from perch_core.vehicle import Vehicle
 
 
 class ThrustBelief:
-    """Owns the rotors' health, and gives flight, law and augmentation the vehicle that follows from it.
+    """Owns the rotors' health, and passes the resulting vehicle model to flight state, law and augmentation.
 
     Attributes:
-        health: of the rotors.
-        felt: specific force along b3, as measured last [m/s^2].
+        health: health of the rotors.
+        felt: last measured specific force along b3 [m/s^2].
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -27,12 +27,14 @@ class ThrustBelief:
         self.health = RotorHealth(4.0 * vehicle.thrust_max / vehicle.hover_thrust)
 
     def reset(self, x: FlightState, law: Law, compensator: L1Augmentation | None) -> FlightState:
-        """The rotors are started: they are as the file says until they show otherwise."""
+        """Return to the thrust of the vehicle file, as the rotors are started."""
         self.health.reset()
         return self._believed(x, law, compensator)
 
     def judged(self, x: FlightState, law: Law, compensator: L1Augmentation | None, fresh: bool) -> FlightState:
-        """Compare felt and promised thrust in free air, `fresh`: `felt` is of the present; weak rotors are a weaker vehicle from now on."""
+        """Compare measured and modelled thrust in free flight; adopt a weaker vehicle model where the rotors are found weak.
+
+        `fresh`: whether `felt` is up to date."""
         if not fresh or x.at_ground or x.may_touch(CONTACT_EARLY) or hypot(*x.belief[10:13]) > RATE_MOST:
             self.health.pause(x.now)
         elif self.health.update(self.felt, self._promised(x), x.now):
@@ -42,17 +44,18 @@ class ThrustBelief:
         return x
 
     def ratio(self, compensator: L1Augmentation | None) -> float:
-        """Thrust / mass that a contact would be flown with, over the vehicle file's: what `adopted` would believe."""
+        """Thrust / mass that would be used for a contact, over the vehicle file's: the ratio that `adopted` would set."""
         return self.health.believed if compensator is None else self.health.adoptable
 
     def shown(self, x: FlightState) -> Vehicle:
-        """The vehicle whose thrust is what has been felt in the air lately, however little that differs from the file's."""
+        """Vehicle model with the recently measured thrust, however close to the file's; with weak rotors, the model in use."""
         return x.vehicle if x.weak else self._nominal.giving(self.health.shown)
 
     def adopted(self, x: FlightState, law: Law, compensator: L1Augmentation | None) -> FlightState:
-        """Before a contact: what L1 makes up for in hover because thrust / mass is not the file's belongs to the thrust.
+        """Before a contact, attribute the error of thrust / mass that L1 compensates in hover to the thrust model.
 
-        As an acceleration it would be wrong as soon as the vehicle tilts and the thrust changes, and too fast for any filter.
+        As a constant acceleration, the compensation would be wrong once the vehicle tilts and the thrust changes, which is too
+        fast for any filter.
         """
         before = self.health.believed
         if compensator is None or not self.health.adopt():

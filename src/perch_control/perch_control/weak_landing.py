@@ -1,7 +1,7 @@
-"""Down to the ground on rotors that are too weak to go on: level, slow, and braked as well as the thrust that is left allows.
+"""Landing on rotors that are too weak to continue: level, slow, and braked as well as the remaining thrust allows.
 
-Height comes first: the vehicle leans only as far as its weight is still carried, or by a small angle where it is not, not at
-all where it falls too fast, and stands level when it touches, since a rotor that touches first breaks.
+Height has priority: the vehicle leans only as far as its weight is still carried, or by a small angle where it is not. Where it
+falls too fast, it leans by 2 deg at most; it is also level at touchdown, since a rotor that touches the ground first breaks.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ _DELAY = 0.1       # until the rotors have answered [s]
 
 
 class WeakLanding(ByState):
-    """Guidance from the present state; `update` first in each period, then `setpoint`."""
+    """Guidance by the present state; in each period, `update` is called before `setpoint`."""
 
     def __init__(self, speed: float, state: tuple[float, ...], ground: float) -> None:
         """
         Args:
-            speed: of the descent [m/s].
-            state: where it begins, 13 floats (p, v, q, w).
+            speed: descent speed [m/s].
+            state: initial state, 13 floats (p, v, q, w).
             ground: height at which the vehicle was armed [m].
         """
         self._speed, self._ground = speed, ground
         self._setpoint = Setpoint(state[0:3], state[3:6], h=horizontal(axes_of(state[6:10])[1]))
 
     def update(self, state: tuple[float, ...], specific_thrust_max: float) -> None:
-        """Take the present state and the greatest collective thrust / mass that is left [m/s^2]."""
+        """Compute the demand from the present state and the greatest remaining collective thrust / mass [m/s^2]."""
         p, v, most = state[0:3], state[3:6], specific_thrust_max
         carried = acos(min(GRAVITY / most, 1.0))
         lean = min(max(carried, _LEAN), _LEAN_MOST)
@@ -62,9 +62,9 @@ class WeakLanding(ByState):
         self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=self._setpoint.h)
 
     def setpoint(self, t: float) -> Setpoint:
-        """The demand of the last `update`: an acceleration without position or velocity error."""
+        """Return the demand of the last `update`: an acceleration with zero position and velocity error."""
         return self._setpoint
 
     def resting(self, state: tuple[float, ...]) -> bool:
-        """The descent that is asked for does not happen: something carries the vehicle."""
+        """Whether the commanded descent does not take place, because something carries the vehicle."""
         return abs(state[5]) < min(0.1, 0.5 * self._speed)

@@ -1,7 +1,7 @@
 """Polynomials in Bernstein form on [0, 1]: value(s) = sum_i c_i B_i^n(s), B_i^n(s) = C(n, i) s^i (1 - s)^(n - i).
 
-Coefficients stand on the last axis (degree + 1 of them); leading axes are any number of polynomials. The form is
-well conditioned, and the smallest and largest coefficient enclose the values: that is what bounds are proved with.
+Coefficients are on the last axis (degree + 1 of them); leading axes hold any number of polynomials. The form is
+well conditioned, and all values lie between the smallest and the largest coefficient, which proves bounds.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def values_at(coefficients: Array, choose: Array, s: float) -> Array:
 
 
 def evaluate(coefficients: Array, s: Array | float) -> Array:
-    """Values of polynomials.
+    """Evaluate polynomials at arguments s.
 
     Args:
         coefficients: shape (..., degree + 1).
@@ -110,7 +110,7 @@ def elevation_matrix(degree: int, to_degree: int) -> Array:
 
 
 def elevate(coefficients: Array, to_degree: int) -> Array:
-    """The same polynomials in a basis of a higher degree, shape (..., to_degree + 1)."""
+    """Express polynomials in the basis of a higher degree, shape (..., to_degree + 1)."""
     coefficients = np.asarray(coefficients, float)
     return coefficients @ elevation_matrix(coefficients.shape[-1] - 1, to_degree).T
 
@@ -145,6 +145,6 @@ def power_matrix(degree: int) -> Array:
 
 
 def to_powers(coefficients: Array) -> Array:
-    """Coefficients of ascending powers of s, shape as given. Loses about 0.5 * degree digits: not for bounds."""
+    """Coefficients of ascending powers of s, same shape. About 0.5 * degree digits are lost: do not use it for bounds."""
     coefficients = np.asarray(coefficients, float)
     return coefficients @ power_matrix(coefficients.shape[-1] - 1).T

@@ -26,7 +26,7 @@ Region = tuple[slice, slice]  # rows and columns of an image
 
 @dataclass(frozen=True)
 class _Camera:
-    """What all projections share: image size, focal lengths, principal point."""
+    """Base of all projections: image size, focal lengths and principal point."""
 
     width: int
     height: int
@@ -78,7 +78,7 @@ class PinholeCamera(_Camera):
             points_C: shape (..., 3) [m].
 
         Returns:
-            Pixels (..., 2), NaN where the point is not in front of the camera, and a mask (...) that says so.
+            Pixels (..., 2), NaN where the point is not in front of the camera, and the mask (...) of the valid ones.
             A valid pixel may lie outside the image: see `contains`.
         """
         points_C = np.asarray(points_C, dtype=float)
@@ -103,13 +103,13 @@ class PinholeCamera(_Camera):
                          np.stack([zero, self.fy / z, -self.fy * y / z**2], -1)], -2)
 
     def shape_at(self, theta: Array) -> Array:
-        """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2)."""
+        """d theta / d r and r / theta, shape (n, 2), at angles theta (n,) from the axis; r is the normalised image radius."""
         theta = np.asarray(theta, float) + 1e-9
         return np.column_stack([np.cos(theta) ** 2, np.tan(theta) / theta])
 
 
 class _DistortedCamera(_Camera):
-    """A camera whose equations are in kernels, which take it as the tuple `lens`."""
+    """Base of the cameras with distortion: compiled kernels evaluate the equations from the tuple `lens`."""
 
     _kernels: ClassVar[ModuleType]
 
@@ -124,8 +124,8 @@ class _DistortedCamera(_Camera):
             points_C: shape (..., 3) [m].
 
         Returns:
-            Pixels (..., 2), NaN where the lens does not see the point: behind the camera, in its optical centre, or beyond `max_angle`;
-            and a mask (...) that says so. A valid pixel may lie outside the image: see `contains`.
+            Pixels (..., 2), NaN where no projection exists: behind the camera, in its optical centre, or beyond `max_angle`;
+            and the mask (...) of the valid ones. A valid pixel may lie outside the image: see `contains`.
         """
         points, shape = _rows(points_C, 3)
         pixels, valid = np.empty((len(points), 2)), np.empty(len(points), bool)
@@ -133,7 +133,7 @@ class _DistortedCamera(_Camera):
         return pixels.reshape(*shape, 2), valid.reshape(shape)
 
     def unproject(self, pixels: Array) -> Array:
-        """Unit rays in C, shape (..., 3), of pixels (..., 2); NaN where the lens sees nothing."""
+        """Unit rays in C, shape (..., 3), of pixels (..., 2); NaN where no ray projects to the pixel."""
         rows, shape = _rows(pixels, 2)
         rays_C = np.empty((len(rows), 3))
         self._kernels.unproject(self.lens, rows, rays_C)
@@ -151,7 +151,7 @@ class _DistortedCamera(_Camera):
 class RadialTangentialCamera(_DistortedCamera):
     """Perspective camera with the distortion of Brown and Conrady: ROS's `plumb_bob` and `rational_polynomial`, OpenCV's default.
 
-    The equations are in `perch_core.radtan`. Nothing is projected from where the polynomial would fold back into the image.
+    The equations are in `perch_core.radtan`. Points where the polynomial would fold back into the image are not projected.
 
     Attributes:
         width, height: image size [px].
@@ -172,12 +172,12 @@ class RadialTangentialCamera(_DistortedCamera):
 
     @property
     def model(self) -> str:
-        """The name in sensor_msgs/CameraInfo."""
+        """Name of the distortion model in sensor_msgs/CameraInfo."""
         return "plumb_bob" if len(self.coefficients) == 5 else "rational_polynomial"
 
     @cached_property
     def distortion(self) -> Array:
-        """The coefficients, shape (5,) or (8,)."""
+        """Distortion coefficients, shape (5,) or (8,)."""
         return np.array(self.coefficients, dtype=float)
 
     @cached_property
@@ -197,15 +197,12 @@ class RadialTangentialCamera(_DistortedCamera):
 
     @cached_property
     def lens(self) -> tuple[float, ...]:
-        """As the kernels of `perch_core.radtan` take it."""
+        """Parameters as the kernels of `perch_core.radtan` take them."""
         k = (*self.coefficients, 0.0, 0.0, 0.0)[:8]
         return tuple(float(x) for x in (self.fx, self.fy, self.cx, self.cy, *k, self.max_radius, self.near))
 
     def shape_at(self, theta: Array) -> Array:
-        """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2).
-
-        The tangential part, some 1e-3 of the radius, is left out.
-        """
+        """d theta / d r and r / theta, shape (n, 2), at angles theta (n,) from the axis; r is the normalised image radius."""
         theta = np.asarray(theta, float) + 1e-9
         out = np.tan(theta)
         g, slope = interpreted(radtan.gain)(self.lens, out**2), interpreted(radtan.gain_slope)(self.lens, out**2)
@@ -216,16 +213,16 @@ class RadialTangentialCamera(_DistortedCamera):
 class EquidistantCamera(_DistortedCamera):
     """Fisheye camera of Kannala and Brandt with four coefficients: ROS's `equidistant`, OpenCV's `fisheye`.
 
-    A ray at the angle theta from the optical axis is seen at the radius
+    A ray at the angle theta from the optical axis is imaged at the radius
     theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) of the normalised image plane.
-    The polynomial of a real lens turns over somewhere past 90 deg, and points behind that would fold back
-    into the image: nothing beyond `max_angle` is ever projected.
+    The polynomial of a real lens has a maximum somewhere beyond 90 deg, and points past it would fold back
+    into the image: points beyond `max_angle` are not projected.
 
     Attributes:
         width, height: image size [px].
         fx, fy, cx, cy: focal lengths and principal point [px].
         coefficients: k1..k4.
-        angle_limit: largest angle from the optical axis that the lens sees [rad]; the turning point of the
+        angle_limit: largest angle from the optical axis that the lens covers [rad]; the maximum of the
             polynomial limits it further.
     """
 
@@ -257,7 +254,7 @@ class EquidistantCamera(_DistortedCamera):
 
     @cached_property
     def lens(self) -> tuple[float, ...]:
-        """As the kernels of `perch_core.lens` take it."""
+        """Parameters as the kernels of `perch_core.lens` take them."""
         return tuple(float(x) for x in (self.fx, self.fy, self.cx, self.cy, *self.coefficients, self.max_angle))
 
     def radius(self, theta: float) -> float:
@@ -265,7 +262,7 @@ class EquidistantCamera(_DistortedCamera):
         return kernels.radius(self.lens, float(theta))
 
     def shape_at(self, theta: Array) -> Array:
-        """d theta / d r and r / theta at angles theta (n,) from the axis, r the radius in the normalised image plane; shape (n, 2)."""
+        """d theta / d r and r / theta, shape (n, 2), at angles theta (n,) from the axis; r is the normalised image radius."""
         theta = np.asarray(theta, float)
         r = interpreted(kernels.radius)(self.lens, theta)
         ratio = np.divide(r, theta, out=np.ones_like(theta), where=theta > 1e-12)
@@ -273,13 +270,13 @@ class EquidistantCamera(_DistortedCamera):
 
 
 def _rows(array: Array, width: int) -> tuple[Array, tuple[int, ...]]:
-    """Vectors of any leading shape one below the other, and that shape."""
+    """Return vectors with any leading shape as rows, shape (n, width), and that leading shape."""
     array = np.asarray(array, dtype=float)
     return np.ascontiguousarray(array).reshape(-1, width), array.shape[:-1]
 
 
 def _positive_roots(polynomial: np.polynomial.Polynomial) -> list[float]:
-    """Square roots of a polynomial's real positive roots."""
+    """Square roots of the real positive roots of a polynomial."""
     roots: np.ndarray = polynomial.trim(1e-300).roots()
     return [math.sqrt(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
 
@@ -288,16 +285,16 @@ Camera = PinholeCamera | RadialTangentialCamera | EquidistantCamera
 
 
 def camera_of(model: str, width: int, height: int, K: Array, distortion: Array) -> Camera:
-    """The camera of a calibration in the words of sensor_msgs/CameraInfo.
+    """Return the camera of a calibration given as in sensor_msgs/CameraInfo.
 
     Args:
-        model: `plumb_bob`, `rational_polynomial` or `equidistant`; empty: not distorted.
+        model: `plumb_bob`, `rational_polynomial` or `equidistant`; empty: no distortion.
         width, height: image size [px].
         K: intrinsic matrix, shape (3, 3).
-        distortion: coefficients of the model; none: not distorted.
+        distortion: coefficients of the model; empty: no distortion.
 
     Raises:
-        ConfigError: another model, another number of coefficients, or a matrix that is none (all zero: not calibrated).
+        ConfigError: unknown model, wrong number of coefficients, invalid size or intrinsic matrix (all zero: not calibrated).
     """
     K, d = np.asarray(K, float), np.asarray(distortion, float).ravel()
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
@@ -320,5 +317,5 @@ def camera_of(model: str, width: int, height: int, K: Array, distortion: Array) 
 
 
 def camera_parameters(camera: Camera) -> tuple[str, tuple[float, ...]]:
-    """Distortion model and coefficients of a camera in the words of sensor_msgs/CameraInfo."""
+    """Distortion model and coefficients of a camera as in sensor_msgs/CameraInfo."""
     return camera.model, tuple(float(k) for k in camera.distortion)

@@ -1,4 +1,4 @@
-"""How a camera is mounted on the vehicle, and how it keeps time."""
+"""Mounting and timing of a camera on the vehicle."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from perch_core.errors import ConfigError
 
 @dataclass(frozen=True)
 class CameraMount:
-    """A camera on the vehicle: where it sits and how it keeps time.
+    """A camera on the vehicle with its pose and its timing.
 
-    The stamp of an image is the board's; the middle of its exposure on the IMU's clock is stamp - stamp_offset.
+    An image carries the camera board's stamp; the middle of its exposure on the IMU's clock is stamp - stamp_offset.
     The image leaves the sensor `readout` after the end of the exposure, and arrives after a further transport
     delay drawn from [transport_min, transport_max].
 
@@ -26,9 +26,9 @@ class CameraMount:
         R_BC: attitude of C in B, shape (3, 3).
         rate: frames per second [Hz].
         exposure: exposure time [s].
-        exposure_max: longest exposure that the driver sets by itself in the dark [s].
+        exposure_max: longest exposure that the driver's automatic exposure sets [s].
         readout: time to read the frame out [s].
-        transport_min, transport_max: range of the delay until it arrives [s].
+        transport_min, transport_max: range of the transport delay [s].
         stamp_offset: stamp minus the time of the middle of the exposure on the IMU's clock [s].
         colour: whether the sensor delivers rgb8 instead of mono8.
     """

@@ -1,7 +1,7 @@
-"""A cable hanging between two points: the catenary, and the straight segments that stand for it. [P:sec. IV-A]
+"""A cable hanging between two points: the catenary, and its approximation by straight segments. [P:sec. IV-A]
 
 In the plane of the cable, x along the horizontal and z against gravity, z(x) = a cosh((x - x0)/a) + const with the
-parameter a = H/w: horizontal tension over weight per length. Arc length is closed form, so is its inverse.
+parameter a = H/w: horizontal tension over weight per length. Arc length and its inverse have closed forms.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Catenary:
 
     Attributes:
         start, end: supports in W [m], shape (3,).
-        parameter: a = H/w [m]; inf is a straight cable.
+        parameter: a = H/w [m]; inf: a straight cable.
     """
 
     start: Array
@@ -46,10 +46,10 @@ class Catenary:
 
     @classmethod
     def from_sag(cls, start: Array, end: Array, sag: float) -> Catenary:
-        """The cable whose middle (of the span) hangs `sag` [m] below the chord.
+        """Return the cable that hangs `sag` [m] below the chord at mid-span.
 
         Raises:
-            PerchError: the sag is negative, or the ends are one above the other.
+            PerchError: the sag is negative or too large for the span, or one end is vertically above the other.
         """
         if not (math.isfinite(sag) and sag >= 0):
             raise PerchError(f"cable: sag {sag!r} is not a length >= 0 m")
@@ -84,7 +84,7 @@ class Catenary:
 
     @cached_property
     def _x0(self) -> float:
-        """Place of the lowest point, from the start along the horizontal [m]; may lie outside the span."""
+        """Horizontal distance of the lowest point from the start [m]; the point may lie outside the span."""
         a, h = self.parameter, self._span
         return h / 2 - a * math.asinh(self._rise / (2 * a * math.sinh(h / (2 * a))))
 
@@ -134,12 +134,12 @@ class Catenary:
 
 @dataclass(frozen=True, eq=False)
 class SegmentFit:
-    """Straight pieces that stand for a cable.
+    """Approximation of a cable by straight segments.
 
     Attributes:
-        vertices: their ends in W [m], shape (count + 1, 3), on the cable.
-        max_error: greatest distance between cable and pieces [m].
-        mean_error: mean distance along the pieces [m].
+        vertices: ends of the segments in W [m], shape (count + 1, 3), on the cable.
+        max_error: greatest distance between cable and segments [m].
+        mean_error: mean distance along the segments [m].
     """
 
     vertices: Array
@@ -148,10 +148,10 @@ class SegmentFit:
 
 
 def fit_segments(cable: Catenary, count: int) -> SegmentFit:
-    """`count` chords of a cable, placed so that all are equally wrong.
+    """Approximate a cable by `count` chords with equal errors.
 
     The sagitta of a short chord is curvature * length^2 / 8, and a catenary's curvature is a/(a^2 + s^2) at the
-    arc length s from the lowest point; the integral of its root is x/sqrt(a). So vertices that are evenly
+    arc length s from the lowest point; the integral of its root is x/sqrt(a). Vertices that are evenly
     spaced along the *horizontal* spread the error evenly. Both errors are exact, not sampled.
 
     Raises:

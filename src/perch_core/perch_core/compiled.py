@@ -1,8 +1,8 @@
 """C source as a shared library, compiled once per machine and kept in a cache.
 
 The cache is `$PERCH_CACHE` or `~/.cache/perch`. A library's name is the hash of its source, the compiler, its flags and the
-processor, so that a change of any of them makes a new one. It is written under a temporary name and renamed, so that two
-processes may do it at once. Without a compiler, or with PERCH_COMPILE=0, there is none, and the caller interprets.
+processor: a change of any of them yields a new library. It is written under a temporary name and then renamed, so that
+several processes may compile it at once. Without a compiler, or with PERCH_COMPILE=0, there is no library; callers fall back.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ FLAGS = ("-O2", "-march=native", "-ffp-contract=off", "-fPIC", "-shared")
 
 
 def cache_folder() -> Path:
-    """Where compiled libraries are kept."""
+    """Return the folder in which compiled libraries are cached."""
     return Path(os.environ.get("PERCH_CACHE") or Path.home() / ".cache" / "perch")
 
 
 @lru_cache(maxsize=1)
 def compiler() -> tuple[str, str] | None:
-    """Path and version of the C compiler ($CC, gcc, cc or clang), or None."""
+    """Return path and version of the C compiler ($CC, gcc, cc or clang), or None."""
     for name in (os.environ.get("CC"), "gcc", "cc", "clang"):
         path = shutil.which(name) if name else None
         if path:
@@ -37,7 +37,7 @@ def compiler() -> tuple[str, str] | None:
 
 
 def _processor() -> str:
-    """What -march=native depends on: a cache on a shared disk must not serve another processor."""
+    """Return the processor features that -march=native uses: a cache on a shared disk must not serve another processor."""
     try:
         with open("/proc/cpuinfo", encoding="ascii", errors="replace") as info:
             return next((line for line in info if line.startswith(("flags", "Features"))), "")
@@ -46,15 +46,15 @@ def _processor() -> str:
 
 
 def library(name: str, source: str, flags: tuple[str, ...] = FLAGS) -> Path | None:
-    """Compile C source, or find it compiled.
+    """Compile C source, or return the cached library.
 
     Args:
-        name: beginning of the file's name, for people.
+        name: prefix of the file name, for readers.
         source: C code.
-        flags: of the compiler.
+        flags: compiler flags.
 
     Returns:
-        The shared library, or None where there is no compiler or it is not wanted.
+        The shared library, or None without a compiler or with PERCH_COMPILE=0.
 
     Raises:
         RuntimeError: the compiler failed; its first lines are in the message.

@@ -1,10 +1,10 @@
-"""The contract of a component: what a node does, without ROS and without a clock.
+"""Contract of a component: the work of a node, without ROS and without a clock.
 
-A component takes typed values on its inputs and emits typed values on its outputs. Time is the newest stamp that it was
-given; it never asks what time it is. What moves values between components is a *host*; there are three, each one class for all
-components, and a component cannot tell which one it has:
+A component takes typed values on its inputs and emits typed values on its outputs. Its time is the newest stamp that it has
+received; it never reads a clock. A *host* moves values between components. There are three hosts, each one class for all
+components, and a component works the same under each of them:
 
-* **arrival** (`perch_core.ros.arrival`): a ROS message comes in, the component works, its outputs are published;
+* **arrival** (`perch_core.ros.arrival`): each message that arrives is passed to the component, and its outputs are published;
 * **lockstep** (`perch_sim.ros`): the same node, its inputs ordered by the simulator's schedule;
 * **in process** (`perch_eval.in_process`): components and schedule in one loop, without ROS.
 
@@ -16,11 +16,11 @@ components, and a component cannot tell which one it has:
             ...
             self.odometry(state)
 
-What is beyond the limits of its type (`perch_core.values.limits`) never reaches `on_<name>`: it is refused at the door, with one
-warning that names channel, field, value and range, whichever host brings it.
+A value beyond the limits of its type (`perch_core.values.limits`) does not reach `on_<name>`: under every host it is refused with
+a warning that names channel, field, value and range. Inputs with `answered=True` are the exception.
 
-A port's *channel* is the topic's relative name. `{name}` in it stands for the parameter `name` of the component. Which ROS
-message a channel carries, with which QoS, and how it becomes a value, is written once per channel in `perch_core.ros.topics`.
+A port's *channel* is the topic's relative name. `{name}` in it stands for the parameter `name` of the component.
+`perch_core.ros.topics` defines once per channel its ROS message, its QoS and the conversion to and from values.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ A = TypeVar("A")
 
 
 class _Port:
-    """What all ports share: the name of the attribute that declares it, and its channel."""
+    """Base of all ports: the name of the attribute that declares the port, and its channel."""
 
     def __init__(self, channel: str) -> None:
         self._channel, self.name = channel, ""
@@ -49,35 +49,35 @@ class _Port:
         self.name = name
 
     def channel(self, component: Component[Any]) -> str:
-        """The channel, with the component's parameters in the place of `{...}`."""
+        """Return the channel, with the component's parameters in place of `{...}`."""
         if "{" not in self._channel:
             return self._channel
         return self._channel.format(**vars(component.config))
 
     def handler(self, component: Component[Any]) -> Callable[..., Any]:
-        """The bound method `on_<name>`."""
+        """Return the bound method `on_<name>`."""
         handler: Callable[..., Any] = getattr(component, f"on_{self.name}")
         return handler
 
 
 class Input(_Port, Generic[V]):
-    """Values that the component takes by `on_<name>(value)`, in the order in which the host has them."""
+    """Input port: the host passes each value to `on_<name>(value)`, in the order in which it has them."""
 
     def __init__(self, value: type[V], channel: str, *, lazy: bool = False, answered: bool = False) -> None:
         """
         Args:
             value: type of the values.
             channel: relative name of the topic.
-            lazy: values need not be delivered when they arrive, only before the next input that is not lazy, and every few
-                hundredths of a second: a message that wakes a process costs 50 to 100 us, one that is taken with another 5.
-            answered: the component refuses nonsense itself, because it answers it.
+            lazy: values may wait until the next input that is not lazy, at most a few hundredths of a second: a message that
+                wakes a process costs 50 to 100 us, one that is taken together with another 5 us.
+            answered: the component checks the limits itself, because it answers refused values, too.
         """
         super().__init__(channel)
         self.value, self.lazy, self.answered = value, lazy, answered
 
 
 class Output(_Port, Generic[V]):
-    """Values that the component emits by `self.<name>(value)`."""
+    """Output port: the component emits a value by `self.<name>(value)`."""
 
     def __init__(self, value: type[V], channel: str) -> None:
         super().__init__(channel)
@@ -93,7 +93,7 @@ class Output(_Port, Generic[V]):
 
 
 class Emitter(Generic[V]):
-    """An output of one component; a call hands the value to every receiver."""
+    """Output of one component; a call passes the value to every receiver."""
 
     __slots__ = ("receivers", "asked")
 
@@ -107,27 +107,27 @@ class Emitter(Generic[V]):
 
     @property
     def wanted(self) -> bool:
-        """Whether anybody would receive a value: what is costly to make need not be made for nobody."""
+        """Whether a value would have a receiver; without one, the component may skip costly values."""
         return bool(self.receivers) if self.asked is None else self.asked()
 
 
 class Wake(_Port):
-    """Calls `on_<name>(now)` periodically with the host's time [ns], whether or not inputs come: silence is an input, too.
+    """Periodic call of `on_<name>(now)` with the host's time [ns], also while no input arrives.
 
-    The host's time need not be that of the stamps: compare it with itself only.
+    The host's time may differ from that of the stamps: compare it only with itself.
     """
 
     def __init__(self, period: float) -> None:
         """
         Args:
-            period: [s].
+            period: interval between calls [s].
         """
         super().__init__("")
         self.period = period
 
 
 class Service(_Port, Generic[Q, A]):
-    """Requests that are answered once each, now or later: `on_<name>(request, reply)`; `reply(answer)` sends the answer."""
+    """Service port: `on_<name>(request, reply)` takes a request; `reply(answer)` sends its one answer, at once or later."""
 
     def __init__(self, request: type[Q], answer: type[A], channel: str) -> None:
         super().__init__(channel)
@@ -135,10 +135,10 @@ class Service(_Port, Generic[Q, A]):
 
 
 class Client(_Port, Generic[Q, A]):
-    """Requests to another component: `self.<name>(request, due)`; the answer comes to `on_<name>(answer)`.
+    """Client port: `self.<name>(request, due)` sends a request; the answer is passed to `on_<name>(answer)`.
 
-    `due` [ns] is the stamp from which on the answer counts in simulation, where work takes no time of its own; elsewhere it comes
-    when it is there. A server that is missing or fails answers with `Unavailable`.
+    In simulation, where work takes no simulated time, the answer is delivered at the stamp `due` [ns]; elsewhere, as soon as it
+    is available. Where the server is missing or fails, the answer is `Unavailable`.
     """
 
     def __init__(self, request: type[Q], answer: type[A], channel: str) -> None:
@@ -152,31 +152,31 @@ class Client(_Port, Generic[Q, A]):
 
 @dataclass(frozen=True)
 class Unavailable:
-    """The answer in the place of one that cannot be had; `reason` for people."""
+    """Answer to a request whose server is missing or has failed; `reason` is for people."""
 
     reason: str
 
 
 class Goal(Protocol):
-    """A goal under way, as the host hands it to `on_<name>`.
+    """An active goal, as the host passes it to `on_<name>`.
 
     Attributes:
-        value: what is asked for.
-        cancel_requested: whoever sent it wants it to end.
+        value: the goal itself.
+        cancel_requested: whether the client has requested its cancellation.
     """
 
     value: Any
     cancel_requested: bool
 
     def feedback(self, value: Any) -> None:
-        """Tell whoever sent it how it goes."""
+        """Send feedback to the client."""
 
     def finish(self, ending: str, result: Any) -> None:
-        """End it; once. `ending`: "succeeded", "cancelled" or "aborted"."""
+        """End the goal, once. `ending`: "succeeded", "cancelled" or "aborted"."""
 
 
 class Action(_Port):
-    """Goals: `on_<name>(goal)` takes a `Goal`, and returns why it is rejected, or an empty string."""
+    """Action port: `on_<name>(goal)` takes a `Goal` and returns the reason for its rejection, or an empty string."""
 
     def __init__(self, goal: type, feedback: type, result: type, channel: str) -> None:
         super().__init__(channel)
@@ -184,24 +184,24 @@ class Action(_Port):
 
 
 class JobStopped(PerchError):
-    """A job was stopped at its limit."""
+    """A job did not end within its time limit."""
 
 
 class JobFailed(PerchError):
-    """An isolated job ended without an answer: its process crashed, ran out of memory, or raised what nobody had foreseen."""
+    """An isolated job has no result: it was refused, crashed, ran out of memory, or raised an unexpected exception."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Long work that the host runs elsewhere: `function(*arguments)`.
+    """Long computation, `function(*arguments)`, that the host runs outside the component's thread.
 
     Attributes:
-        function: of a module; it must be picklable, and so must `arguments` and what it returns, where `isolated`.
+        function: module-level function; where `isolated`, it, `arguments` and its result must be picklable.
         arguments: its arguments.
-        then: called on the component's thread with what it returned, or with the exception that ended it.
-        limit: wall-clock time from when the host was given it, after which it is stopped, which ends it with `JobStopped` [s];
-            None: never. The jobs before it count.
-        isolated: run in a process that can be killed; otherwise on a thread, which a limit cannot stop.
+        then: called on the component's thread with the result, or with the exception that ended the job.
+        limit: wall-clock time from submission [s], after which the job ends with `JobStopped`; None: no limit. The time spent
+            waiting for earlier jobs counts.
+        isolated: run in a process that can be killed; otherwise on a thread, to which `limit` does not apply.
     """
 
     function: Callable[..., Any]
@@ -212,7 +212,7 @@ class Job:
 
 
 def run_now(job: Job) -> None:
-    """A job where nobody waits for anything else: at once, on the caller's thread, without a limit."""
+    """Run a job at once, on the caller's thread and without a limit."""
     try:
         result = job.function(*job.arguments)
     except PerchError as error:
@@ -222,7 +222,7 @@ def run_now(job: Job) -> None:
 
 @dataclass(frozen=True)
 class LogLine:
-    """A line for people. `level`: debug, info, warning, error. `every`: at most one of this text in so many seconds of wall-clock time."""
+    """A log line. `level`: debug, info, warning or error. `every`: least wall-clock time between two lines of its kind [s]."""
 
     level: str
     text: str
@@ -231,11 +231,11 @@ class LogLine:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """How a component is, about once a second.
+    """Health of a component, emitted about once a second.
 
     Attributes:
         stamp: [ns].
-        values: name -> number or word; names carry the unit (`_ms`, `_s`). The host adds what its calls took.
+        values: name -> number or word; names carry the unit (`_ms`, `_s`). The host adds the durations of its calls.
         level: 0 ok, 1 warning, 2 error.
         message: one line for people.
     """
@@ -251,8 +251,8 @@ class Component(Generic[C]):
 
     Attributes:
         config_type: the parameters' class, set by the subclass.
-        config: the present parameters.
-        work: gives a `Job` to the host; the host sets it, on its own a component works at once.
+        config: the current parameters.
+        work: submits a `Job`; set by the host. The default, `run_now`, runs it at once.
     """
 
     config_type: ClassVar[type]
@@ -261,7 +261,7 @@ class Component(Generic[C]):
     diagnostics = Output(Diagnostics, "/diagnostics")
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Put a door before each handler of values that have limits."""
+        """Wrap each handler of values that have limits in a check of these limits."""
         super().__init_subclass__(**kwargs)
         for port in ports(cls, Input):
             take = vars(cls).get(f"on_{port.name}")
@@ -271,7 +271,7 @@ class Component(Generic[C]):
     def __init__(self, config: C) -> None:
         """
         Raises:
-            ConfigError: a parameter names what is not there.
+            ConfigError: a parameter names something that does not exist, such as a file.
         """
         self.config = config
         self.work: Callable[[Job], None] = run_now
@@ -279,28 +279,28 @@ class Component(Generic[C]):
             self.__dict__[port.name] = Emitter()
 
     def warm_up(self) -> None:
-        """Load or compile what would hold up a flight; the host calls it before the first input."""
+        """Load or compile everything that would cause delays in flight; the host calls it before the first input."""
 
     def preload(self) -> Callable[[], None] | None:
-        """What loads all that isolated jobs use, picklable; None: nothing.
+        """Return a picklable function that loads everything isolated jobs use, or None.
 
-        A host with processes for isolated jobs gives it to `perch_core.isolated.IsolatedRunner`, another calls it after `warm_up`.
+        A host with processes for isolated jobs passes it to `perch_core.isolated.IsolatedRunner`.
         """
         return None
 
     def reconfigure(self, config: C) -> None:
-        """Take new parameters in flight; only those that the class names in `changeable` differ.
+        """Apply new parameters in flight; only those named in `changeable` can differ.
 
         Raises:
-            ConfigError: a value is refused; the old ones stay.
+            ConfigError: a value is refused; the old parameters remain in effect.
         """
         self.config = config
 
     changeable: ClassVar[tuple[str, ...]] = ()
-    """Dotted names, or their beginnings with a trailing dot, of parameters that may change in flight; `("",)`: all."""
+    """Dotted names of parameters that may change in flight, or prefixes with a trailing dot; `("",)`: all."""
 
     def close(self) -> None:
-        """Free what the component holds: files, processes, sockets."""
+        """Release the resources of the component: files, processes, sockets."""
 
     def info(self, text: str) -> None:
         """Log a line."""
@@ -326,7 +326,7 @@ P = TypeVar("P", bound=_Port)
 
 
 def ports(component: type[Component[Any]], kind: type[P]) -> Iterator[P]:
-    """The ports of a class, in the order of their declaration, those of its bases first."""
+    """Yield the ports of a class, in the order of their declaration, those of its bases first."""
     seen: dict[str, Any] = {}
     for cls in reversed(component.__mro__):
         for name, value in vars(cls).items():

@@ -1,8 +1,8 @@
 """Vector algebra on tuples of components, so that one formula serves numbers, arrays and CasADi symbols.
 
 A vector is a tuple of components; each component is a float, a numpy array (many vectors at once: any shape, the same
-for all) or a CasADi `SX`/`MX` scalar. Nothing here imports CasADi: a symbol brings its own arithmetic. Written out by
-component, products with constant zeros vanish from the symbolic graph, which is what keeps the compiled functions small.
+for all) or a CasADi `SX`/`MX` scalar. This module does not import CasADi: symbols implement the arithmetic. As formulas are
+written out by component, products with constant zeros vanish from the symbolic graph, which keeps compiled functions small.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Vector = tuple[Scalar, ...]
 
 
 def components(vector: Any) -> Vector:
-    """The components of a vector: the last axis of an array, the rows of a CasADi column, a tuple as it is."""
+    """Return the components of a vector: along the last axis of an array, the rows of a CasADi column, or a tuple unchanged."""
     if isinstance(vector, tuple):
         return vector
     if isinstance(vector, (np.ndarray, list)):
@@ -30,7 +30,7 @@ def stack(vector: Vector) -> np.ndarray:
 
 
 def function(name: str, value: Scalar) -> Scalar:
-    """`sqrt`, `arctan`, `tanh`, `exp` of a number, an array or a symbol (a symbol's own method)."""
+    """Apply `sqrt`, `arctan`, `tanh` or `exp` to a number, an array or a symbol (by the symbol's own method)."""
     method = getattr(value, name, None)
     return method() if method is not None else getattr(np, name)(value)
 
@@ -74,10 +74,10 @@ def matrix_of(q_AB: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def rotate(q_AB: Vector, v_B: Vector) -> Vector:
-    """`q_AB (.) v_B`: vector in A of a vector in B."""
+    """Rotate a vector from B to A: `q_AB (.) v_B`."""
     return tuple(dot(row, v_B) for row in matrix_of(q_AB))
 
 
 def rotate_back(q_AB: Vector, v_A: Vector) -> Vector:
-    """`q_BA (.) v_A`: vector in B of a vector in A."""
+    """Rotate a vector from A to B: `q_BA (.) v_A`."""
     return tuple(dot(column, v_A) for column in zip(*matrix_of(q_AB)))

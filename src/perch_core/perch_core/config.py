@@ -1,7 +1,7 @@
-"""YAML files into frozen dataclasses, strictly: unknown keys, wrong types and values out of range are refused.
+"""Strict conversion of YAML files to frozen dataclasses: unknown keys, wrong types and values out of range are refused.
 
 A configuration class is a frozen dataclass whose fields are declared with `quantity`, `text`, `vector` or `part`;
-the declaration holds unit, range and meaning once, for files, ROS parameters and the documentation.
+the declaration defines unit, range and meaning once, for files, ROS parameters and the documentation.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="DataclassInstance")
 LARGEST = {"m": 1e4, "m/s": 100.0, "m/s^2": 1e3, "m/s^3": 1e5, "rad": 1e3, "rad/s": 1e4, "rad/s^2": 1e4, "deg": 360.0, "s": 3600.0, "Hz": 1e4,
            "kg": 50.0, "kg m^2": 10.0, "N": 1e3, "N/s": 1e5, "N s/m": 100.0, "N s^2/rad^2": 1e-2, "px": 1e4}
-"""Greatest magnitude of a quantity of a unit where its field says nothing; far above what any vehicle here is or does."""
+"""Default bound on the magnitude of a quantity, by unit; far beyond the values of any supported vehicle."""
 LARGEST_NUMBER = 1e6
-"""The same of every other number."""
+"""Default bound on the magnitude of every other number."""
 LONGEST_TEXT = 2000
 NAME = re.compile(r"\w[\w .+-]{0,99}")
-"""Of a thing that folders, files or topics are named after."""
+"""Pattern of names that are used for folders, files or topics."""
 
 
 def quantity(default: Any = MISSING, *, unit: str = "", low: float | None = None, high: float | None = None,
              doc: str = "", above: float | None = None) -> Any:
-    """A number (or tuple of numbers) with unit and range; `low`/`high` are inclusive, `above` is exclusive.
+    """Declare a number (or tuple of numbers) with unit and range; `low`/`high` are inclusive, `above` is exclusive.
 
-    Where a bound is missing it is that of `LARGEST`.
+    A missing bound is taken from `LARGEST`.
     """
     largest = LARGEST.get(unit, LARGEST_NUMBER)
     low, high = -largest if low is None and above is None else low, largest if high is None else high
@@ -47,40 +47,40 @@ def quantity(default: Any = MISSING, *, unit: str = "", low: float | None = None
 
 
 def choice(default: Any = MISSING, *, options: tuple[str, ...], doc: str = "") -> Any:
-    """A word out of `options`."""
+    """Declare a word out of `options`."""
     return field(default=default, metadata={"options": options, "doc": doc})
 
 
 def text(default: Any = MISSING, *, doc: str = "") -> Any:
-    """A free string (a path, a name)."""
+    """Declare a free string (a path, a name)."""
     return field(default=default, metadata={"doc": doc})
 
 
 def label(default: Any = MISSING) -> Any:
-    """What folders, files or topics are named after: no separators, no control characters."""
+    """Declare a name that is used for folders, files or topics: no separators, no control characters."""
     return field(default=default, metadata={"label": True})
 
 
 def part(cls: type, *, doc: str = "") -> Any:
-    """A nested configuration that may be left out: its own defaults then count."""
+    """Declare a nested configuration that may be omitted; its own defaults then apply."""
     return field(default_factory=cls, metadata={"doc": doc})
 
 
 def derived(default: Any) -> Any:
-    """What follows from other fields, as from a file that one of them names: no key of a file, and no ROS parameter."""
+    """Declare a field that follows from others, as from a file that one of them names: no key of a file, and no ROS parameter."""
     return field(default=default, metadata={"derived": True})
 
 
 def settable(cls: type[DataclassInstance]) -> list[Field[Any]]:
-    """The fields of a configuration class that a file or a parameter may set."""
+    """Return the fields of a configuration class that a file or a parameter may set."""
     return [item for item in fields(cls) if item.init and "derived" not in item.metadata]
 
 
 def check(source: str, key: str, item: Field[Any], value: Any) -> None:
-    """Refuse a number out of the declared range, or a word that is no option.
+    """Check a value against its declaration: range, options, length of text, form of a name.
 
     Raises:
-        ConfigError: with the value and its allowed range.
+        ConfigError: it is not allowed; the message has the value and what is allowed.
     """
     meta = item.metadata
     options = meta.get("options")
@@ -98,7 +98,7 @@ def check(source: str, key: str, item: Field[Any], value: Any) -> None:
 
 
 def _numbers(value: Any) -> Iterator[float]:
-    """The numbers of a value, also of tuples in it; what has a class of its own has been checked."""
+    """Yield the numbers of a value and of nested tuples; nested dataclasses have been checked already."""
     if isinstance(value, (tuple, list)):
         for entry in value:
             yield from _numbers(entry)
@@ -107,7 +107,7 @@ def _numbers(value: Any) -> Iterator[float]:
 
 
 def _convert(kind: Any, value: Any, source: str, key: str) -> Any:
-    """Bring a YAML value to the type of a field, without guessing."""
+    """Convert a YAML value to the type of a field, strictly."""
     origin = typing.get_origin(kind)
     if origin in (typing.Union, types.UnionType):
         if value is None:
@@ -143,7 +143,7 @@ def _convert(kind: Any, value: Any, source: str, key: str) -> Any:
 
 
 def unknown(source: str, key: str, kind: str, names: Iterable[str]) -> ConfigError:
-    """The error for a name that does not exist: it lists the names there are, or the likeliest of many."""
+    """Return the error for an unknown name; it lists the valid names, or the closest matches where there are many."""
     names = list(names)
     close = difflib.get_close_matches(key, names, n=5, cutoff=0.4)
     if len(names) <= 16:
@@ -153,11 +153,11 @@ def unknown(source: str, key: str, kind: str, names: Iterable[str]) -> ConfigErr
 
 
 def from_mapping(cls: type[T], mapping: Any, source: str, prefix: str = "") -> T:
-    """A frozen dataclass from a parsed YAML mapping.
+    """Build a frozen dataclass from a parsed YAML mapping.
 
     Args:
         cls: frozen dataclass.
-        mapping: what the YAML file holds at `prefix`.
+        mapping: content of the YAML file at `prefix`.
         source: file name (or node name), for messages.
         prefix: key of the mapping inside its file, for messages.
 
@@ -197,7 +197,7 @@ def load(cls: type[T], path: Path | str) -> T:
 
 
 def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted names as nested mappings."""
+    """Convert dotted names to nested mappings."""
     out: dict[str, Any] = {}
     for name, value in flat.items():
         *groups, leaf = name.split(".")
@@ -213,7 +213,7 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def flattened(parameters: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested parameters under dotted names, so that later ones replace single values."""
+    """Convert nested parameters to dotted names, so that later ones replace single values."""
     flat: dict[str, Any] = {}
     for key, value in parameters.items():
         if isinstance(value, Mapping):
@@ -224,7 +224,7 @@ def flattened(parameters: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
 
 
 def config_dir() -> Path:
-    """The folder that holds `vehicles/`, `scenarios/`, `boards/`: $PERCH_CONFIG_DIR, the checkout, or the install."""
+    """Return the folder with `vehicles/`, `scenarios/`, `boards/`: $PERCH_CONFIG_DIR, or that of the checkout or installation."""
     if os.environ.get("PERCH_CONFIG_DIR"):
         return Path(os.environ["PERCH_CONFIG_DIR"])
     for folder in Path(__file__).resolve().parents:
@@ -239,10 +239,10 @@ def config_dir() -> Path:
 
 
 def find(kind: str, name_or_path: str | Path) -> Path:
-    """`config/<kind>/<name>.yaml`, or the path itself when it names a file.
+    """Return `config/<kind>/<name>.yaml`, or the path itself where it ends in `.yaml` or `.yml`.
 
     Raises:
-        ConfigError: no such file; the message lists the names there are.
+        ConfigError: no such file; for a name, the message lists the available ones.
     """
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml"):

@@ -1,4 +1,4 @@
-"""What the vehicle looks like and where its frames are: `robot_description`, `/tf_static` and `/tf`."""
+"""Component that publishes the vehicle's shape and frames: `robot_description`, `/tf_static` and `/tf`."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class DescriptionParameters:
 
 
 class Description(Component[DescriptionParameters]):
-    """Tells the vehicle's shape and fixed frames once, and where it and its target are as they are estimated.
+    """Publishes the vehicle's shape and fixed frames once, and the estimated poses of the vehicle and its target as they change.
 
-    `map` and `odom` coincide: the estimate in `odometry` is of one frame, which nothing corrects afterwards.
+    `map` and `odom` coincide: the estimate in `odometry` refers to one frame, and no later correction is applied to it.
     """
 
     config_type = DescriptionParameters
@@ -48,7 +48,7 @@ class Description(Component[DescriptionParameters]):
         self._told = False
 
     def on_start(self, now: int) -> None:
-        """Tell once what does not change, as soon as there is somebody to tell it to."""
+        """Publish the constant outputs once, at the first call."""
         if self._told:
             return
         self._told = True
@@ -58,7 +58,7 @@ class Description(Component[DescriptionParameters]):
             self.static(frame)
 
     def on_odometry(self, state: OdometryState) -> None:
-        """The body in `odom`, at most so often."""
+        """Publish the pose of the body in `odom`, at most every `PERIOD`."""
         if self._next - PERIOD <= state.stamp < self._next:
             return
         if state.frame not in (MAP, ODOM):
@@ -73,7 +73,7 @@ class Description(Component[DescriptionParameters]):
         self.frames(StampedTransform(state.stamp, ODOM, BASE, vector3(state.p_WB), _unit(state.q_WB)))
 
     def on_target(self, pose: TargetPose) -> None:
-        """The target, whenever it is believed to be elsewhere."""
+        """Publish the pose of the target whenever its estimate changes."""
         if self._next >= 0 and pose.stamp > self._next + NANOSECONDS:
             self.warn(f"target/pose: stamp {pose.stamp} ns is ahead of the odometry: ignored", every=1.0)
             return
@@ -84,6 +84,6 @@ class Description(Component[DescriptionParameters]):
 
 
 def _unit(q: Numbers) -> Quaternion:
-    """A quaternion whose norm is 1 but for rounding, normalised."""
+    """Return a quaternion normalised, unchanged where its norm is 1 within 1e-9."""
     norm = hypot(*q)
     return quaternion([float(x) / norm for x in q] if abs(norm - 1.0) > 1e-9 else q)

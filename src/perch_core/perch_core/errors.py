@@ -1,4 +1,4 @@
-"""Typed errors of the whole suite: each says what was wrong, where it came from and what is allowed."""
+"""Typed errors of the whole suite: each names the wrong value, its source and what is allowed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 
 class PerchError(ValueError):
-    """Base of every error that a caller can cause and mend. It survives pickling, whatever its class's constructor takes."""
+    """Base of every error that a caller can cause and correct. It can be pickled whatever arguments its constructor has."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _unpickled, (type(self), self.args, vars(self))
@@ -22,7 +22,7 @@ def _unpickled(cls: type[PerchError], args: tuple[Any, ...], attributes: dict[st
 class ConfigError(PerchError):
     """A value in a YAML file, a parameter or a command line is not usable.
 
-    The message reads `<source>: <key>: <value> <why it is refused>`: one line, however long or odd what it quotes.
+    The message reads `<source>: <key>: <value> <why it is refused>`, on one line; long parts are shortened.
     """
 
     def __init__(self, source: str, key: str, problem: str) -> None:
@@ -31,22 +31,22 @@ class ConfigError(PerchError):
 
 
 def _line(text: str) -> str:
-    """Text on one line, without control characters, its middle left out where it is long."""
+    """Return text on one line, without control characters; the middle of a long text is left out."""
     line = "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
     return line if len(line) <= 1000 else f"{line[:600]} ... {line[-300:]}"
 
 
 class FreeFallError(PerchError):
-    """The specific thrust vanishes, so that flatness defines no attitude. [M:eq10]"""
+    """Raised when the specific thrust vanishes, so that flatness defines no attitude. [M:eq10]"""
 
 
 class PlanningRefusal(PerchError):
-    """A planner answers that there is no plan within the limits.
+    """Raised when a planner finds no plan within the limits.
 
     Attributes:
-        code: machine-readable cause, the lower-case name of the service's error code (`thrust_floor`).
+        code: machine-readable cause: the lower-case name of the service's error code (`thrust_floor`).
         constraint: the violated constraint, in words with its equation.
-        margin: by how much it is violated, in the constraint's own unit (negative: violated).
+        margin: distance from the constraint's limit, in the constraint's own unit; negative: violated.
     """
 
     def __init__(self, code: str, constraint: str, margin: float, message: str) -> None:

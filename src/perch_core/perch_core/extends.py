@@ -1,4 +1,4 @@
-"""Files that build on each other: `extends: line_80` takes over what the file itself does not say."""
+"""YAML files that extend each other: `extends: line_80` inherits every key that the file itself does not set."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ LONGEST_CHAIN = 10
 
 
 def extended_mapping(kind: str, name_or_path: str | Path) -> dict[str, Any]:
-    """What a file says with all that it extends: mappings are merged key by key, everything else is replaced.
+    """Return the content of a file merged over all files that it extends: mappings key by key, other values replaced.
 
     Args:
         kind: folder in `config`.
-        name_or_path: a name in that folder, or a file. So is the value of `extends`; a file is found from the folder of the
-            one that extends it.
+        name_or_path: a name in that folder, or a file. The same holds for the value of `extends`; its path is relative to the
+            folder of the file that extends it.
 
     Raises:
-        ConfigError: no such file, one that is no mapping, or files that extend each other in a circle; with the chain of files.
+        ConfigError: no such file, a file that is no mapping, or a cycle of files; the message names the chain of files.
     """
     return _merged(kind, config.find(kind, name_or_path), ())
 
@@ -49,7 +49,7 @@ def _merged(kind: str, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
 
 
 def _over(base: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
-    """`content` over `base`."""
+    """Return `base` with `content` merged over it."""
     out = dict(base)
     for key, value in content.items():
         below = out.get(key)

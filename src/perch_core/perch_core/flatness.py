@@ -18,7 +18,7 @@ _HEADING_FLOOR = 1e-6          # sine of the angle between b3 and b2_des below w
 
 
 class HeadingError(FreeFallError):
-    """The thrust points along b2_des, so that the yaw reference defines no b1. [M:eq12]"""
+    """Raised when the thrust is parallel to b2_des, so that the yaw reference defines no b1. [M:eq12]"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class FlatState:
 
 @compiled(inline=True)
 def direction_derivatives(f: Numbers, df: Numbers, ddf: Numbers) -> tuple[Vector3, Vector3, Vector3]:
-    """Unit vector along f with its first and second derivative."""
+    """Return the unit vector along f with its first and second derivative."""
     k = 1.0 / norm(f)
     u = scale(k, f)
     dn = dot(u, df)
@@ -56,7 +56,7 @@ def direction_derivatives(f: Numbers, df: Numbers, ddf: Numbers) -> tuple[Vector
 
 @compiled(inline=True)
 def turned_heading(sy: float, cy: float, yaw_rate: float, yaw_acc: float) -> tuple[Vector3, Vector3, Vector3]:
-    """b2_des = (-sin yaw, cos yaw, 0) with its first and second derivative from sine and cosine of the yaw. [M:eq12]"""
+    """b2_des = (-sin yaw, cos yaw, 0) with its first and second derivative, given sine and cosine of the yaw. [M:eq12]"""
     return ((-sy, cy, 0.0), (-cy * yaw_rate, -sy * yaw_rate, 0.0),
             (sy * yaw_rate * yaw_rate - cy * yaw_acc, -cy * yaw_rate * yaw_rate - sy * yaw_acc, 0.0))
 
@@ -70,11 +70,11 @@ def heading_derivatives(yaw: float, yaw_rate: float, yaw_acc: float) -> tuple[Ve
 @compiled(inline=True)
 def commanded_frame(f: Numbers, df: Numbers, ddf: Numbers, h: Numbers, dh: Numbers, ddh: Numbers
                     ) -> tuple[Vector3, Vector3, Vector3, Vector3, Vector3]:
-    """Commanded attitude, body rates and angular accelerations of a force and a heading vector. [defines M:eq10, M:eq12, M:eq13]
+    """Commanded attitude, body rates and angular accelerations for force and heading vectors. [defines M:eq10, M:eq12, M:eq13]
 
     Args:
         f, df, ddf: specific force and its derivatives, |f| > 0.
-        h, dh, ddh: wanted direction of b2 (b2_des) and its derivatives; not parallel to f.
+        h, dh, ddh: desired direction of b2 (b2_des) and its derivatives; not parallel to f.
 
     Returns:
         b1, b2, b3 (columns of R_C), w_C and dw_C in the commanded frame [rad/s, rad/s^2].
@@ -118,7 +118,7 @@ def attitude(b3_W: Array, yaw: float) -> Array:
 
 
 def flat_to_state(p: Numbers, v: Numbers, a: Numbers, j: Numbers, s: Numbers, yaw: float, yaw_rate: float, yaw_acc: float, mass: float) -> FlatState:
-    """State, body rates, angular accelerations and thrust of the flat outputs. [M:eq9-13]
+    """State, body rates, angular accelerations and thrust for given flat outputs. [M:eq9-13]
 
     Args:
         p: position in W [m], shape (3,).
@@ -136,7 +136,7 @@ def flat_to_state(p: Numbers, v: Numbers, a: Numbers, j: Numbers, s: Numbers, ya
 
     Raises:
         FreeFallError: the specific thrust vanishes [M:eq10].
-        HeadingError: the thrust points along b2_des [M:eq12].
+        HeadingError: the thrust is parallel to b2_des [M:eq12].
     """
     j, s = (float(j[0]), float(j[1]), float(j[2])), (float(s[0]), float(s[1]), float(s[2]))
     f = (float(a[0]), float(a[1]), float(a[2]) + GRAVITY)

@@ -1,4 +1,4 @@
-"""IMU samples in the axes of B, wherever the IMU's own point."""
+"""Rotation of IMU samples into the axes of B, for an IMU mounted in any orientation."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from perch_core.static_transforms import BASE, StaticTransforms
 from perch_core.values import ImuSample, Transform
 
 IMU_AXES = "sensor file, config/sensors/<name>.yaml or a path: axes of the IMU; empty: those of its frame by /tf_static"
-"""The parameter `sensors` of a node that needs no more of the file."""
+"""Description of the parameter `sensors` of nodes that use only the IMU's axes from the file."""
 _ORIGIN = 0.01  # an IMU further from the origin of B is told of [m]
 AXES_OF_B = frozenset(("imu_link", BASE, ""))
 
 
 class ImuAxes:
-    """Turns samples into the axes of B: by the sensor file where it has an IMU, otherwise by the sample's frame and `/tf_static`."""
+    """Rotates samples into the axes of B, by the sensor file if it has an IMU, or else by the sample's frame and `/tf_static`."""
 
     def __init__(self, warn: Callable[[str, float], None], sensors: str = "") -> None:
         """
         Args:
-            warn: called with a warning and the least time between two of its kind [s].
-            sensors: sensor file; empty: none.
+            warn: called with a warning and the least time between two warnings of its kind [s].
+            sensors: sensor file; empty: no file.
 
         Raises:
             ConfigError: no such file, or a value that is refused.
@@ -35,13 +35,13 @@ class ImuAxes:
         self._turns: dict[str, np.ndarray] = {}  # frame -> R_BI
 
     def add_transform(self, transform: Transform) -> None:
-        """Take where a frame is in another."""
+        """Add a transform of `/tf_static`."""
         if problem := self._transforms.add(transform):
             self._warn(f"/tf_static: {problem}", 1.0)
         self._turns.clear()
 
     def in_body(self, sample: ImuSample) -> ImuSample | None:
-        """The sample in the axes of B; None where nobody has said yet what its axes are."""
+        """Return the sample in the axes of B; None while the axes of its frame are unknown."""
         if self._R_BI is not None:
             return _turned(sample, self._R_BI)
         if sample.frame in AXES_OF_B:
@@ -50,7 +50,7 @@ class ImuAxes:
         return None if R_BI is None else _turned(sample, R_BI)
 
     def _axes(self, frame: str) -> np.ndarray | None:
-        """R_BI of a frame, shape (3, 3); None where it is not known."""
+        """R_BI of a frame, shape (3, 3); None while it is unknown."""
         if frame not in self._turns:
             place = self._transforms.pose(frame)
             if place is None:

@@ -1,4 +1,4 @@
-"""Ctrl-C while a program comes up. Loads nothing itself: whatever loads before it is interrupted with a traceback."""
+"""Handling of Ctrl-C during start-up. Imports little itself, because an interrupt before its use shows a traceback."""
 
 import os
 import signal
@@ -11,9 +11,9 @@ INTERRUPTED = 130  # exit code
 
 @contextmanager
 def quiet_on_interrupt() -> Iterator[None]:
-    """Around imports, which take seconds: Ctrl-C ends the process without a traceback, unless somebody has a use of their own for it.
+    """Let Ctrl-C end the process without a traceback during imports, which take seconds; another handler of SIGINT is kept.
 
-    A Ctrl-C that `scripts/run_node.py` held back while Python started counts here.
+    A Ctrl-C that `scripts/run_node.py` blocked while Python started takes effect here.
     """
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield

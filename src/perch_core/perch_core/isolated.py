@@ -1,7 +1,7 @@
-"""Jobs in a process that can be killed: one that hangs costs its limit, never the process that asked. No ROS.
+"""Jobs in a process that can be killed: a job that hangs ends at its time limit and does not block the caller. No ROS.
 
-This is the caller's side; `isolated_process` is the other one: a supervisor that has loaded everything, and its child that works.
-The child stays from job to job; after one that was stopped or crashed, the supervisor forks the next from its own memory.
+This module is the caller's side. `isolated_process` is the other side: a supervisor that has loaded everything, and its child,
+which executes the jobs one after the other. After a job was stopped or crashed, the supervisor forks a new child.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from typing import Any
 from perch_core.component import Job, JobFailed, JobStopped
 
 MEMORY = 4 << 30
-"""Address space of a job's process [byte]; with numpy, CasADi and compiled kernels 0.4 GiB of it are used before any work."""
+"""Address space of a job's process [byte]; numpy, CasADi and compiled kernels use 0.4 GiB of it before the first job."""
 START_TIMEOUT = 300.0
-"""[s]; a first start on a machine compiles."""
+"""Time-out for the supervisor's start [s]; the first start on a machine compiles kernels."""
 COMMAND = (sys.executable, "-m", "perch_core.isolated_process")
 WAITING_MAX = 64
-"""Jobs that wait; more are refused."""
+"""Greatest number of queued jobs; further jobs are refused."""
 _GRACE = 1.0  # [s] past a job's limit, within which the supervisor must have stopped it
 _HEADER = struct.Struct("<d")  # of a job on the pipe: its limit [s]; what follows is pickled (function, arguments)
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What the supervisor is sent first; `path` is the caller's `sys.path`."""
+    """First message to the supervisor: `path` is the caller's `sys.path`, `memory` the address space of the child [byte]."""
 
     path: tuple[str, ...]
     memory: int
@@ -47,7 +47,7 @@ class Setup:
 
 @dataclass
 class _Task:
-    """A job under way: what is sent, when it must have ended on the monotonic clock [s], and what the caller holds."""
+    """A submitted job: the serialised call, its limit [s], its deadline on the monotonic clock [s], and the caller's future."""
 
     name: str
     payload: bytes
@@ -57,18 +57,18 @@ class _Task:
 
 
 class IsolatedRunner:
-    """Runs jobs one after the other in another process, each within its limit.
+    """Runs jobs one after the other in another process, each within its time limit.
 
-    Building one returns at once; a limit counts from `submit`, so that jobs which come before `wait_ready` are likely to be stopped.
+    The constructor returns at once. Limits count from `submit`: jobs submitted before `wait_ready` may time out during start-up.
     `close` ends all processes, and so does the end of the caller. Ctrl-C in the caller's terminal does not reach them.
     """
 
     def __init__(self, preload: Callable[[], Any] | None = None, memory: int = MEMORY, command: tuple[str, ...] = COMMAND) -> None:
         """
         Args:
-            preload: of a module, picklable; called once in the supervisor, so that every child has what it loads.
+            preload: module-level function, picklable; called once in the supervisor, so that every child inherits what it loads.
             memory: address space of a job's process [byte].
-            command: starts the supervisor; the number of its end of the pipe and this process's id are appended.
+            command: starts the supervisor; the file descriptor of its end of the pipe and this process's id are appended.
         """
         self._preload = pickle.dumps(preload)
         self._setup = Setup(tuple(sys.path), memory)
@@ -86,10 +86,10 @@ class IsolatedRunner:
         self._thread.start()
 
     def wait_ready(self) -> bool:
-        """Wait until the supervisor has loaded everything.
+        """Wait until the supervisor has loaded everything; False after `START_TIMEOUT`.
 
         Raises:
-            JobFailed: it could not; the message says why.
+            JobFailed: the supervisor could not start; the message has the reason.
         """
         if not self._started.wait(START_TIMEOUT):
             return False
@@ -99,19 +99,19 @@ class IsolatedRunner:
 
     @property
     def pid(self) -> int:
-        """Process id of the supervisor, which leads a process group of its own; 0: there is none."""
+        """Process id of the supervisor, the leader of its own process group; 0: no supervisor has been started."""
         process = self._process
         return 0 if process is None else process.pid
 
     def submit(self, job: Job) -> Future[Any]:
-        """Have a job done; returns at once.
+        """Submit a job; returns at once.
 
         Args:
-            job: its `then` is the host's matter.
+            job: the job; its `then` is not called here but by the host.
 
         Returns:
-            Completed by another thread, with what the function returned or the error that ended it: its own, if it is a
-            `PerchError`, `JobStopped` or `JobFailed`.
+            A future, completed by another thread with the function's result, or with the error that ended the job: the
+            function's own `PerchError`, `JobStopped` or `JobFailed`.
         """
         now = time.monotonic()
         limit = inf if job.limit is None else float(job.limit)
@@ -132,7 +132,7 @@ class IsolatedRunner:
         return task.future
 
     def close(self) -> None:
-        """End the processes, in the middle of a job, too; jobs that have not ended fail."""
+        """End the processes, even during a job; jobs that have not ended fail."""
         with self._lock:
             if not self._closing:
                 self._closing = True
@@ -142,7 +142,7 @@ class IsolatedRunner:
             self._thread.join(timeout=5.0)
 
     def _call(self) -> None:
-        """Have the runner's thread look for what there is to do."""
+        """Wake the runner's thread, so that it checks for work."""
         with suppress(BlockingIOError):  # it has been called often enough
             self._wake.send(b".")
 
@@ -165,13 +165,13 @@ class IsolatedRunner:
             end.close()
 
     def _heard(self, until: float = inf) -> bool:
-        """Wait for the supervisor, a call, or a time; jobs whose limit passes while they wait fail then.
+        """Wait for the supervisor, a wake-up call or a time; queued jobs whose limit has passed fail.
 
         Args:
-            until: on the monotonic clock [s].
+            until: latest time on the monotonic clock [s].
 
         Returns:
-            Whether there is something on the supervisor's pipe.
+            Whether the supervisor's pipe has data.
         """
         soonest = min([until, *(task.end for task in self._waiting())])
         pipes: list[socket.socket | Connection] = [self._woken] if self._pipe is None else [self._woken, self._pipe]
@@ -185,12 +185,12 @@ class IsolatedRunner:
         return self._pipe in heard
 
     def _waiting(self) -> list[_Task]:
-        """The jobs that wait; others may come meanwhile."""
+        """Return a copy of the queue; other threads may append to the queue meanwhile."""
         with self._lock:
             return list(self._tasks)
 
     def _start(self) -> None:
-        """Start a supervisor, and send it what it needs."""
+        """Start a supervisor and send it its set-up and preload."""
         mine, theirs = Pipe()
         self._ready, self._problem = False, ""
         self._started.clear()
@@ -208,7 +208,7 @@ class IsolatedRunner:
             mine.send_bytes(self._preload)
 
     def _hear(self) -> None:
-        """The supervisor says that it is ready, or why not; or it has ended: another is started, if this one was of use."""
+        """Receive the supervisor's report that it is ready, or why not; if it has ended after it was ready, start another one."""
         assert self._pipe is not None
         try:
             answer = self._pipe.recv_bytes().decode()
@@ -228,7 +228,7 @@ class IsolatedRunner:
         self._started.set()
 
     def _do(self, task: _Task) -> None:
-        """Have one job done, and complete its future."""
+        """Run one job and complete its future."""
         left = task.end - time.monotonic()
         if left <= 0.0:
             _fail(task, self._late(task))
@@ -276,7 +276,7 @@ class IsolatedRunner:
                 os.killpg(self._process.pid, signal.SIGKILL)  # its own group: supervisor, child and what they started
 
     def _end(self) -> None:
-        """End the supervisor and what it started."""
+        """End the supervisor and the processes that it has started."""
         with self._lock:
             self._ready = False
             if self._process is not None:
@@ -289,7 +289,7 @@ class IsolatedRunner:
 
 
 def _opened(answer: bytes) -> tuple[bytes, Any]:
-    """Kind and content of an answer: A what was returned, E what was raised, T stopped, F failed, in words."""
+    """Return kind and content of an answer: A the result, E the exception, T stopped at the limit, F failed with a message."""
     kind, content = answer[:1], answer[1:]
     if kind in (b"T", b"F"):
         return kind, content.decode()

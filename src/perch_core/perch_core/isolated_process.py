@@ -1,7 +1,7 @@
-"""The process of isolated jobs: a supervisor that keeps everything loaded, and a child that works and may be killed.
+"""The processes of isolated jobs: a supervisor that keeps everything loaded, and a child that executes jobs and may be killed.
 
-When the child does not answer in time, the supervisor kills it and forks the next from its own memory, which takes
-milliseconds where a new Python with its libraries takes seconds. Run by `isolated.IsolatedRunner`, never by hand.
+When the child does not answer in time, the supervisor kills it and forks a new one, which takes milliseconds; starting a
+new Python with its libraries would take seconds. Started by `isolated.IsolatedRunner`, not by hand.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from perch_core.isolated import _HEADER, Setup
 from perch_core.processes import end_with_parent
 
 OUT_OF_MEMORY = 42
-"""Exit status of a child that ran out of memory so far that it could not say so."""
+"""Exit status of a child without enough memory left to report that it ran out of memory."""
 
 
 def _answer(payload: bytes, memory: int) -> bytes:
-    """Do a job; its answer as `isolated._opened` takes it."""
+    """Execute a job; return the answer in the format of `isolated._opened`."""
     try:
         function, arguments = pickle.loads(payload)
         result = function(*arguments)
@@ -48,7 +48,7 @@ def _too_much(memory: int) -> str:
 
 
 def _child(pipe: Connection, supervisor: int, memory: int) -> None:
-    """Do jobs until the pipe closes."""
+    """Execute jobs until the pipe closes."""
     end_with_parent(signal.SIGKILL)
     if os.getppid() != supervisor:
         os._exit(0)
@@ -75,7 +75,7 @@ def _fork(upstream: Connection, memory: int) -> tuple[int, Connection]:
 
 
 def _ended(status: int, memory: int) -> str:
-    """Why a child has ended, in words."""
+    """Return why a child has ended, as text."""
     if os.WIFSIGNALED(status):
         name = signal.Signals(os.WTERMSIG(status)).name
         return f"its process crashed ({name}); the limit of its memory is {memory / 2**30:.3g} GiB"
@@ -85,7 +85,7 @@ def _ended(status: int, memory: int) -> str:
 
 
 def supervise(upstream: Connection) -> None:
-    """Have the jobs that come down a pipe done until it closes: `Setup`, then the preload, then jobs."""
+    """Serve a pipe until it closes: receive `Setup`, then the preload, then jobs, and have the child execute these."""
     setup: Setup = upstream.recv()
     sys.path[:] = setup.path
     try:
@@ -117,11 +117,11 @@ def supervise(upstream: Connection) -> None:
 
 
 def _do(job: bytes, child: Connection, upstream: Connection, pid: int, memory: int) -> tuple[bytes | None, bool]:
-    """Have a child do a job.
+    """Have a child execute a job.
 
     Returns:
-        Its answer, None where the child ended before it took the job; and whether it has ended. Where the caller has gone
-        away, `upstream` is closed.
+        The answer, None if the child ended before it took the job; and whether the child has ended. If the caller has
+        ended, `upstream` is closed.
     """
     limit, = _HEADER.unpack_from(job)
     try:
@@ -142,7 +142,7 @@ def _do(job: bytes, child: Connection, upstream: Connection, pid: int, memory: i
 
 
 def main() -> None:
-    """Serve the pipe whose number is the last but one argument of the command line; the last is the caller's process id."""
+    """Serve a pipe; the last two arguments of the command line are its file descriptor and the caller's process id."""
     end_with_parent(signal.SIGKILL)
     if os.getppid() != int(sys.argv[-1]):
         return

@@ -1,11 +1,11 @@
-"""Kernels are written once: numba compiles them where it is installed, the interpreter runs them where it is not.
+"""Decorator for numerical kernels: numba compiles them where it is installed; otherwise they are interpreted.
 
-Compiled code is cached beside its source, so that only the first process of a checkout pays for it. PERCH_NUMBA=0 turns
+Compiled code is cached beside its source, so that only the first process of a checkout compiles. PERCH_NUMBA=0 turns
 compilation off: the same results to rounding, many times slower.
 
-Much of numba's own cost is spared: it is imported by the first call of a kernel, as most processes import kernels and call none
-(0.3 s); without `coverage`, where nobody measures that (0.1 s); and compiled code is loaded without registering everything that could
-be compiled (0.5 s).
+Three measures shorten numba's start. It is imported by the first call of a kernel, as most processes import kernels and call
+none (0.3 s); it does not import `coverage` unless coverage is being measured (0.1 s); and loading compiled code does not
+fill the compiler's registries (0.5 s).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ COMPILED = os.environ.get("PERCH_NUMBA") != "0" and find_spec("numba") is not No
 
 @lru_cache(maxsize=None)
 def _njit() -> Any:
-    """numba's decorator; numba takes our kernels for its own."""
+    """Return numba's decorator, with `_Compiled` registered as a type that numba treats like its own dispatchers."""
     measured = "coverage" in sys.modules
     if not measured:
         sys.modules["coverage"] = cast(Any, None)  # numba goes on where this import fails
@@ -44,7 +44,7 @@ def _njit() -> Any:
 
 @lru_cache(maxsize=None)
 def _stamp(package: Path) -> str:
-    """Hash of every file with kernels in a package and in this one."""
+    """Return the hash of all files with kernels in a package and in this one."""
     digest = hashlib.sha256()
     for folder in sorted({package, Path(__file__).parent}):
         for path in sorted(folder.rglob("*.py")):
@@ -55,7 +55,7 @@ def _stamp(package: Path) -> str:
 
 
 def _package(file: Path) -> Path:
-    """The outermost package that holds a file."""
+    """Return the outermost package that contains a file."""
     folder = file.parent
     while (folder.parent / "__init__.py").exists():
         folder = folder.parent
@@ -63,9 +63,9 @@ def _package(file: Path) -> Path:
 
 
 def _load(cache: Any, signature: Any, target: Any) -> Any:
-    """A kernel's compiled code for a signature from its cache; None where there is none, and the compiler registers what it needs.
+    """Load a kernel's compiled code for a signature from its cache; None if it is not cached, in which case numba compiles it.
 
-    In place of `numba.core.caching.Cache.load_overload`. What compiled code calls in numba's runtime has to be there.
+    Replaces `numba.core.caching.Cache.load_overload`; numba's runtime, which compiled code calls, must be initialised.
     """
     from numba.core.runtime import rtsys
 
@@ -74,7 +74,7 @@ def _load(cache: Any, signature: Any, target: Any) -> Any:
 
 
 class _Compiled:
-    """A kernel that numba compiles, or loads, when it is called. A call costs about 0.2 us more than one of numba's own.
+    """A kernel that numba compiles or loads when it is called. A call costs about 0.2 us more than that of a numba dispatcher.
 
     Attributes:
         py_func: the plain function.
@@ -88,7 +88,7 @@ class _Compiled:
 
     @cached_property
     def dispatcher(self) -> Any:
-        """numba's own object for this kernel."""
+        """numba's dispatcher of this kernel."""
         out = _njit()(cache=True, error_model="numpy", **self._options)(self.py_func)
         # numba's cache looks at the kernel's own file alone: a change in a kernel that it calls in another file would go
         # unseen. The hash of all sources with kernels takes the place of that file's date.
@@ -111,13 +111,13 @@ def compiled(kernel: Kernel) -> Kernel: ...
 @overload
 def compiled(*, nogil: bool = False, inline: bool = False) -> Callable[[Kernel], Kernel]: ...
 def compiled(kernel: Any = None, *, nogil: bool = False, inline: bool = False) -> Any:
-    """Decorator: the kernel compiled by numba with an on-disk cache, or the kernel itself.
+    """Decorate a kernel: numba compiles it with an on-disk cache; without numba it is returned unchanged.
 
-    With `nogil` it runs without the interpreter lock, which pays for kernels of milliseconds beside other threads. With `inline` it
-    becomes a part of the kernels that call it: a loop over such calls, without branches, takes several elements at a time.
+    With `nogil` the kernel runs without the interpreter lock, which pays for kernels of milliseconds beside other threads. With
+    `inline` it is inlined into the kernels that call it, so that loops over such calls without branches can be vectorised.
 
-    Without `fastmath`: results must not depend on how a compiler groups a sum. The plain function stays reachable, see
-    `interpreted`. A kernel may call kernels of its own package and of perch_core.
+    `fastmath` is not used: results must not depend on how a compiler groups a sum. `interpreted` returns the plain function.
+    A kernel may call kernels of its own package and of perch_core.
     """
     if kernel is None:
         return partial(compiled, nogil=nogil, inline=inline)
@@ -128,14 +128,14 @@ def compiled(kernel: Any = None, *, nogil: bool = False, inline: bool = False) -
 
 
 def interpreted(kernel: Kernel) -> Kernel:
-    """The plain function of a kernel."""
+    """Return the plain function of a kernel."""
     plain: Kernel = cast(Any, kernel).py_func
     return plain
 
 
 @contextmanager
 def uncompiled() -> Iterator[None]:
-    """Kernels that are called meanwhile, by any thread, are interpreted: a few calls in a process that needs no others are not worth numba's import."""
+    """Interpret all kernels within this context, in all threads: for a few calls, importing numba takes longer than it saves."""
     _Compiled.plain = True
     try:
         yield

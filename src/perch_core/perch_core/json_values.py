@@ -1,4 +1,4 @@
-"""What JSON can hold, and files of it."""
+"""Conversion of values to JSON, and JSON files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def finite(value: Any) -> Any:
-    """The same without nan and infinities, which JSON has not: null means that a figure is not available."""
+    """Replace nan and infinities, which JSON does not have, by None: null means that a figure is not available."""
     if isinstance(value, Mapping):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -19,10 +19,10 @@ def finite(value: Any) -> Any:
 
 
 def to_text(value: Any) -> str:
-    """As the text of a file for readers, `finite`."""
+    """Return a value as indented JSON text, with `finite` applied."""
     return json.dumps(finite(value), indent=1) + "\n"
 
 
 def write_json(file: Path, value: Any) -> None:
-    """Write `to_text`."""
+    """Write a value to a file as `to_text` formats it."""
     file.write_text(to_text(value))

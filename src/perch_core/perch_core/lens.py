@@ -1,8 +1,8 @@
-"""The equidistant lens of Kannala and Brandt, compiled: what `perch_core.camera.EquidistantCamera` does with arrays.
+"""The equidistant lens of Kannala and Brandt, compiled: kernels of `perch_core.camera.EquidistantCamera`.
 
-A ray at the angle theta from the optical axis is seen at the radius r(theta) = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 +
-k4 theta^8) of the normalised image plane. The kernels take a `lens` (fx, fy, cx, cy, k1, k2, k3, k4, max_angle) and fill arrays
-whose first axis is that of the points; in numpy a call costs 0.2-0.3 ms whatever its size, and a frame needs dozens.
+A ray at the angle theta from the optical axis is imaged at the radius r(theta) = theta (1 + k1 theta^2 + k2 theta^4 +
+k3 theta^6 + k4 theta^8) of the normalised image plane. The kernels take a `lens` (fx, fy, cx, cy, k1, k2, k3, k4, max_angle) and
+fill arrays whose first axis is that of the points. In numpy a call costs 0.2-0.3 ms whatever its size; a frame needs dozens.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def project(lens: tuple[float, ...], points: Array, pixels: Array, valid: np.nda
 
 @compiled
 def unproject(lens: tuple[float, ...], pixels: Array, rays: Array) -> None:
-    """Unit rays (n, 3) of pixels (n, 2); NaN where the lens sees nothing."""
+    """Unit rays (n, 3) of pixels (n, 2); NaN where no ray projects to the pixel."""
     for n in range(pixels.shape[0]):
         x, y = (pixels[n, 0] - lens[2]) / lens[0], (pixels[n, 1] - lens[3]) / lens[1]
         r = math.sqrt(x * x + y * y)

@@ -1,7 +1,7 @@
-"""Powerline segments, Pluecker lines, and the line costs and constraints of paper P, written once. [P:eq3-13]
+"""Powerline segments, Pluecker lines, and the line costs and constraints of paper P. [P:eq3-13]
 
 The functions are generic over numbers, arrays (many states at once) and CasADi symbols: vectors are tuples of
-components, see `components`. Planner, controller and evaluation use the same ones.
+components, see `components`. Planner, controller and evaluation use the same functions.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Segment:
         direction: l_W, unit vector in W, shape (3,).
         half_length: [m].
         radius: of the wire [m].
-        id: number under which the map knows it.
+        id: number of the segment in the map.
     """
 
     centre: Array
@@ -54,12 +54,12 @@ class Segment:
 
     @classmethod
     def between(cls, start: Array, end: Array, radius: float, id: int = 0) -> Segment:
-        """The segment between two end points in W [m]."""
+        """Return the segment between two end points in W [m]."""
         start, end = np.asarray(start, float), np.asarray(end, float)
         return cls((start + end) / 2, end - start, float(np.linalg.norm(end - start)) / 2, radius, id)
 
     def thinner(self, by: float) -> Segment:
-        """The same with a smaller radius [m]; some of it is left."""
+        """Return the segment with its radius reduced by `by` [m]; a small radius always remains."""
         return replace(self, radius=max(self.radius - by, min(self.radius, _THINNEST))) if by > 0.0 else self
 
     @property
@@ -95,17 +95,17 @@ def segment_distance(a: Segment, b: Segment) -> float:
 def perch_normal(line: Segment, point: Array, pitch: float, side_W: Array) -> Array:
     """Direction of b3 at a perch on a line, unit, shape (3,).
 
-    It starts from the direction that is nearest to the vertical and square to the line, and leans by `pitch` towards the side of
-    `side_W`: 0 hangs the line under a level vehicle, pi under one that is upside down.
+    At pitch 0 it is the direction perpendicular to the line that is nearest to the vertical; `pitch` tilts it towards the side of
+    `side_W`. At 0 a level vehicle is above the line, at pi an inverted vehicle is below it.
 
     Args:
         line: the line to grip.
-        point: of the line in W [m], shape (3,).
+        point: a point of the line in W [m], shape (3,).
         pitch: tilt about the line, in [0, pi] [rad].
-        side_W: a point in W on the side that the vehicle comes from [m], shape (3,).
+        side_W: a point in W on the side from which the vehicle approaches [m], shape (3,).
 
     Raises:
-        PerchError: a vertical line.
+        PerchError: the line is vertical.
     """
     up = _E3 - (_E3 @ line.direction) * line.direction
     if np.linalg.norm(up) < _LEVEL_LEAST:
@@ -136,7 +136,7 @@ def scaled_line(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, radii: Vec
 def line_clearance(o: Vector, l: Vector) -> Scalar:
     """Squared distance of a line from the unit ball times |l|^2; positive: no contact. [defines P:eq4, P:eq5]
 
-    The paper's line `(|o|^2 - 1) |l|^2 - (o.l)^2 > 0`, from |o x l|^2 = |o|^2 |l|^2 - (o.l)^2.
+    The paper's expression `(|o|^2 - 1) |l|^2 - (o.l)^2 > 0`, from |o x l|^2 = |o|^2 |l|^2 - (o.l)^2.
     """
     return (dot(o, o) - 1) * dot(l, l) - dot(o, l) * dot(o, l)
 
@@ -164,9 +164,9 @@ def segment_clearance(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, half
                       body_radii: Vector) -> Scalar:
     """h_ca: positive where body and segment do not touch. [defines P:eq7]
 
-    [P:eq5] is at least -|l|^2, where the line would pass through the body's centre, and |l| at most lambda_1. The paper adds lambda_1^2
-    far from the segment, which leaves nothing above zero where the line meets the body's thinnest axis: above a mast. Here it is three
-    times that, so that there h_ca >= 2 |l|^2, as for a line at sqrt(3) radii.
+    [P:eq5] is at least -|l|^2, where the line passes through the body's centre, and |l| is at most lambda_1. The paper adds
+    lambda_1^2 far from the segment; h_ca may then fall to zero where the line coincides with the body's thinnest axis, as above a
+    mast. Here 3 lambda_1^2 are added, so that far from the segment h_ca >= 2 |l|^2, as for a line at sqrt(3) radii.
 
     Args:
         p_WB, q_WB: pose of the body [m, xyzw].
@@ -174,7 +174,7 @@ def segment_clearance(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, half
         body_radii: radii of the body's ellipsoid [m].
 
     Returns:
-        h_ca [1/m^2]; it exceeds zero everywhere outside the segment's surroundings.
+        h_ca [1/m^2]; positive everywhere away from the segment.
     """
     radii = tuple(r + radius for r in body_radii)
     o, l = scaled_line(p_WB, q_WB, o_W, l_W, radii)
@@ -185,10 +185,10 @@ def segment_clearance(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, half
 
 
 def scaled_clearance(states_p: Array, states_q: Array, segment: Segment, body_radii: Vector) -> Array:
-    """Distance of the finite segment in the scaled frame, minus 1: positive where nothing touches.
+    """Distance of the finite segment in the scaled frame, minus 1; positive: no contact.
 
-    The check of finished trajectories: it takes the segment's true ends instead of the fade-out of [P:eq6]. As in the paper, an
-    ellipsoid with longer radii stands for the body's with the wire about it, and is up to 3.4 mm too small beside a wire of 3 cm.
+    Used to check finished trajectories, with the segment's true ends instead of the activation of [P:eq6]. As in the paper, the
+    body's ellipsoid enlarged by the wire is approximated by longer radii, up to 3.4 mm too short beside a wire of 3 cm.
 
     Args:
         states_p, states_q: poses of the body [m, xyzw], shapes (n, 3) and (n, 4).
@@ -222,7 +222,7 @@ def image_line(o_C: Vector, l_C: Vector, fx: float = 1.0, fy: float = 1.0) -> tu
 def reprojection_error(n_I: Vector) -> Scalar:
     """r_e: signed distance of the line from the image centre, in units of the focal length (fx = 1) or pixels. [defines P:eq9]
 
-    It vanishes also where the camera looks along the line or the line lies behind; never use it alone.
+    It also vanishes where the optical axis is parallel to the line and where the line is behind the camera; never use it alone.
     """
     return n_I[2] / function("sqrt", n_I[0] * n_I[0] + n_I[1] * n_I[1])
 
@@ -239,10 +239,10 @@ def cheirality(n_I: Vector, l_I: Vector) -> Scalar:
 
 
 def segment_place(n_I: Vector, l_I: Vector, o_I: Vector, half_length: Scalar) -> tuple[Scalar, Scalar]:
-    """Where the line's point nearest to the image centre lies along its segment. [defines P:eq11, P:eq13]
+    """Position along the segment of the line's point that is nearest to the image centre. [defines P:eq11, P:eq13]
 
-    The paper's point p3D = p2D / d3D_z and constraint -(p3D - e1) . (p3D - e2) > 0 have a pole where the camera looks along the
-    line. With p3D = o_I + s half_length l_I the constraint is s^2 < 1; s d and d = d3D_z have no pole.
+    The paper's point p3D = p2D / d3D_z and constraint -(p3D - e1) . (p3D - e2) > 0 have a pole where the optical axis is
+    along the line. With p3D = o_I + s half_length l_I the constraint is s^2 < 1; s d and d = d3D_z have no pole.
 
     Args:
         n_I, l_I: the line, from `image_line` with fx = fy = 1, |l_I| = 1.

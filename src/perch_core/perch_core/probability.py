@@ -1,4 +1,4 @@
-"""Quantiles and tails. `scipy.stats` has the same figures, but loading it is half of the start of a node."""
+"""Quantiles and tail probabilities. `scipy.stats` has the same functions, but its import takes half of a node's start-up time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scipy.special import betainc, gammaincinv
 
 
 def chi2_quantile(probability: float | np.ndarray, freedom: float | np.ndarray) -> np.ndarray:
-    """What a chi-squared variable stays below with a probability.
+    """Quantile of the chi-squared distribution.
 
     Args:
         probability: in [0, 1], broadcast with `freedom`.
@@ -17,5 +17,5 @@ def chi2_quantile(probability: float | np.ndarray, freedom: float | np.ndarray) 
 
 
 def binomial_tail(least: int, count: int, probability: float) -> float:
-    """Probability that at least `least` >= 1 of `count` independent trials succeed, each with a probability."""
+    """Probability that at least `least` >= 1 of `count` independent trials succeed, each with the given probability."""
     return float(betainc(least, count - least + 1, probability)) if least <= count else 0.0

@@ -1,4 +1,4 @@
-"""What processes and threads ask of the operating system."""
+"""Settings of processes and threads: signals, priorities, BLAS threads and garbage collection."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from multiprocessing import resource_tracker
 
 _PR_SET_PDEATHSIG = 1
 _SET_THREADS = ("openblas_set_num_threads", "openblas_set_num_threads64_", "scipy_openblas_set_num_threads", "scipy_openblas_set_num_threads64_")
-"""Names of one function in OpenBLAS as it comes with Linux, numpy and scipy."""
+"""Names of the same OpenBLAS function in the builds of Linux, numpy and scipy."""
 
 
 def end_with_parent(signal_number: int) -> None:
-    """Have the operating system send this process a signal when the one that started it ends, however it ends (Linux)."""
+    """Have the operating system send this process a signal when its parent ends, for whatever reason (Linux)."""
     with suppress(OSError, AttributeError):  # elsewhere a process ends with its pipes
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal_number))
 
 
 def end_within(seconds: int) -> None:
-    """Have the operating system end this process by SIGALRM, unless it has ended by itself before."""
+    """Have the operating system end this process by SIGALRM after a time [s], unless it ends before."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(seconds)
 
 
 @contextmanager
 def without_interrupts() -> Iterator[None]:
-    """Processes that are started meanwhile do not see Ctrl-C, which is this one's own matter, until they let it through."""
+    """Block SIGINT for processes started in this context until they unblock it: only this process handles Ctrl-C."""
     resource_tracker.ensure_running()  # it lets SIGINT through as it starts
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -39,15 +39,15 @@ def without_interrupts() -> Iterator[None]:
 
 
 def give_way(task: int, nice: int) -> None:
-    """Let others go before a thread (0: the caller): less of the processor, and none that another is using when it wakes up (Linux)."""
+    """Lower the priority of a thread (0: the caller): higher nice value, no preemption of other threads at wake-up (Linux)."""
     os.setpriority(os.PRIO_PROCESS, task, nice)
     with suppress(OSError, AttributeError):
         os.sched_setscheduler(task, os.SCHED_BATCH, os.sched_param(0))
 
 
 def one_thread_for_sums() -> None:
-    """Have BLAS add on one thread in this process, also where it is loaded already: other threads add in another order, which
-    changes the last bits of a flight, and for small matrices they take longer."""
+    """Restrict BLAS to one thread in this process, also where it is loaded already: several threads add in another order, which
+    changes the last bits of a flight, and take longer for small matrices."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"  # of what is loaded later
     with suppress(OSError), open("/proc/self/maps") as file:
@@ -60,7 +60,7 @@ def one_thread_for_sums() -> None:
 
 @contextmanager
 def without_collector() -> Iterator[None]:
-    """Nothing is looked through for garbage meanwhile."""
+    """Disable garbage collection in this context."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -71,14 +71,14 @@ def without_collector() -> Iterator[None]:
 
 
 def freeze_heap() -> None:
-    """Keep what is there now out of the garbage collector's sight: looking through it again takes up to 0.1 s, at any moment."""
+    """Exclude all present objects from garbage collection: scanning them again takes up to 0.1 s, at any moment."""
     gc.collect()
     gc.freeze()
 
 
 @contextmanager
 def frozen_heap() -> Iterator[None]:
-    """`freeze_heap` for as long as it takes."""
+    """Apply `freeze_heap` in this context."""
     freeze_heap()
     try:
         yield

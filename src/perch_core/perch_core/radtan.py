@@ -1,12 +1,12 @@
 """The lens of Brown and Conrady with radial and tangential distortion, compiled: ROS's `plumb_bob` and `rational_polynomial`.
 
-A point at (x, y) of the undistorted image plane (z = 1), r^2 = x^2 + y^2, is seen at
+A point at (x, y) of the undistorted image plane (z = 1), r^2 = x^2 + y^2, is imaged at
 
     x' = x g(r^2) + 2 p1 x y + p2 (r^2 + 2 x^2),   y' = y g(r^2) + p1 (r^2 + 2 y^2) + 2 p2 x y,
     g(t) = (1 + k1 t + k2 t^2 + k3 t^3) / (1 + k4 t + k5 t^2 + k6 t^3).
 
-The kernels take a `lens` (fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, r_max, near) and fill arrays whose first axis is that of the
-points. Beyond `r_max` the radius r g(r^2) falls again, and points would fold back into the image: nothing is projected there.
+The kernels take a `lens` (fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, r_max, near) and fill arrays whose first axis is that
+of the points. Beyond `r_max` the radius r g(r^2) decreases, and points would fold back into the image: they are not projected.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _slopes(lens: tuple[float, ...], x: float, y: float) -> tuple[float, float, 
 
 @compiled
 def _regular(lens: tuple[float, ...], x: float, y: float) -> bool:
-    """Whether neighbours of a point are seen as neighbours, neither folded nor mirrored."""
+    """Return whether a point is within `r_max` and the image around it is neither folded nor mirrored."""
     if not x * x + y * y <= lens[12] * lens[12]:
         return False
     xx, xy, yy = _slopes(lens, x, y)
@@ -81,7 +81,7 @@ def project(lens: tuple[float, ...], points: Array, pixels: Array, valid: np.nda
 
 @compiled
 def _undistorted(lens: tuple[float, ...], x_seen: float, y_seen: float) -> tuple[float, float]:
-    """The point (x, y) that is seen at (x', y'); NaN where none is."""
+    """Return the point (x, y) that is imaged at (x', y'); NaN if there is none."""
     seen = math.sqrt(x_seen * x_seen + y_seen * y_seen)
     if not seen < math.inf:
         return math.nan, math.nan
@@ -116,7 +116,7 @@ def _undistorted(lens: tuple[float, ...], x_seen: float, y_seen: float) -> tuple
 
 @compiled
 def unproject(lens: tuple[float, ...], pixels: Array, rays: Array) -> None:
-    """Unit rays (n, 3) of pixels (n, 2); NaN where the lens sees nothing."""
+    """Unit rays (n, 3) of pixels (n, 2); NaN where no ray projects to the pixel."""
     for n in range(pixels.shape[0]):
         x, y = _undistorted(lens, (pixels[n, 0] - lens[2]) / lens[0], (pixels[n, 1] - lens[3]) / lens[1])
         z = 1.0 / math.sqrt(1.0 + x * x + y * y)

@@ -1,4 +1,4 @@
-"""Names in a registry to the classes behind them."""
+"""Resolution of references `module:name` to Python objects."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from perch_core.errors import ConfigError
 
 
 def resolved(place: str) -> Any:
-    """What stands at `module:name`; the module is imported when it is asked for.
+    """Return the object at `module:name`; its module is imported by this call.
 
     Raises:
-        ConfigError: there is no such module, or nothing of that name in it.
+        ConfigError: the module does not exist, or has no object of that name.
     """
     module, _, name = place.partition(":")
     try:

@@ -1,4 +1,4 @@
-"""The quadrotor down to its rotor thrusts: 17 states, thrust rates as inputs. [P:eq1, P:eq2]
+"""Quadrotor model with the rotor thrusts as states: 17 states, thrust rates as inputs. [P:eq1, P:eq2]
 
 State, in this order: p_WB (3) [m], q_WB (4, xyzw), v_WB (3) [m/s], w_WB_B (3) [rad/s], rotor thrusts gamma (4) [N].
 Input: u = d gamma / dt (4) [N/s]. Every function is generic over numbers, arrays (one vector per entry) and CasADi
@@ -38,7 +38,7 @@ class RotorModel:
 
     @classmethod
     def of(cls, vehicle: Vehicle, gravity: float = GRAVITY) -> RotorModel:
-        """The model of a vehicle; its allocation matrix without the first row is M of [P:eq2]."""
+        """Return the model of a vehicle; its allocation matrix without the first row is M of [P:eq2]."""
         torque = tuple(tuple(float(x) for x in row) for row in vehicle.allocation[1:])
         return cls(float(vehicle.mass), vector3(vehicle.inertia), torque, float(gravity))
 
@@ -82,7 +82,7 @@ def derivative(model: RotorModel, x: Vector, u: Vector) -> Vector:
 
 
 def rk4(model: RotorModel, x: Vector, u: Vector, step: Scalar) -> Vector:
-    """One Runge-Kutta step with the input held. [P:eq14d]
+    """One Runge-Kutta step with constant input. [P:eq14d]
 
     Args:
         model: constants.

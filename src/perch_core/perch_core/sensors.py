@@ -1,7 +1,7 @@
-"""What a vehicle sees and feels with: cameras and IMU as their data sheets and calibration reports have them.
+"""Sensors of a vehicle: cameras and IMU, as described by data sheets and calibration reports.
 
-One YAML file in `config/sensors/` each. Nodes read it (parameter `sensors`), `scripts/perceive.py` does for recordings, and
-`scripts/sensors.py import` makes one of a Kalibr or EuRoC calibration. The simulator does not: what it draws is another matter.
+Each set of sensors is one YAML file in `config/sensors/`. Nodes read it (parameter `sensors`), and so does `scripts/perceive.py`
+for recordings; `scripts/sensors.py import` converts a Kalibr or EuRoC calibration. The simulator does not use it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from perch_core.errors import ConfigError
 
 @dataclass(frozen=True)
 class CalibrationSigmas:
-    """1 sigma of what a camera's calibration leaves open; zero: known exactly. The defaults are those of a careful Kalibr calibration."""
+    """Uncertainty of a camera's calibration, 1 sigma; 0: known exactly. The defaults suit a careful Kalibr calibration."""
 
     rotation: float = quantity(0.005, unit="rad", low=0.0, high=0.2, doc="camera against IMU, per axis")
     translation: float = quantity(0.002, unit="m", low=0.0, high=0.2, doc="camera against IMU, per axis")
@@ -32,13 +32,13 @@ class CalibrationSigmas:
 
     @property
     def lens(self) -> np.ndarray:
-        """Of fx, fy (relative), cx, cy [px], shape (4,)."""
+        """1 sigma of fx, fy (relative), cx, cy [px], shape (4,)."""
         return np.array([self.focal, self.focal, self.centre, self.centre])
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSensor:
-    """A camera as its calibration has it."""
+    """A camera as its calibration describes it."""
 
     model: str = choice(options=("radtan", "equidistant", "pinhole"), doc="projection, in Kalibr's words")
     width: int = quantity(unit="px", low=IMAGE_LEAST, high=1 << 14)
@@ -76,14 +76,14 @@ class CameraSensor:
             raise ConfigError("", "distortion", error.problem) from None
 
     def mount(self, name: str) -> CameraMount:
-        """The camera with its place on the body."""
+        """Return the camera with its pose on the body."""
         return CameraMount(name=name, camera=self.camera, p_BC=np.array(self.position), R_BC=_rotation(self.orientation), rate=self.rate,
                            stamp_offset=self.stamp_offset, colour=self.colour)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImuSensor:
-    """An IMU as its data sheet, or an Allan deviation, has it; where the rotors shake it, with what they add in flight."""
+    """An IMU as described by its data sheet or an Allan deviation; the noise includes vibration in flight."""
 
     rate: float = quantity(unit="Hz", low=10.0, high=4000.0)
     accel_noise_density: float = quantity(unit="m/s^2/sqrt(Hz)", above=0.0, high=10.0)
@@ -120,7 +120,7 @@ class ImuSensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensors:
-    """Cameras by name, and the IMU, as far as they are described. B has its origin in the IMU."""
+    """Cameras by name, and the IMU; each is optional. The origin of B is in the IMU."""
 
     name: str = label()
     cameras: dict[str, CameraSensor] = part(dict)
@@ -128,12 +128,12 @@ class Sensors:
 
     @cached_property
     def mounts(self) -> dict[str, CameraMount]:
-        """The cameras with their places on the body, by name."""
+        """The cameras with their poses on the body, by name."""
         return {name: camera.mount(name) for name, camera in self.cameras.items()}
 
 
 def load_sensors(name_or_path: str | Path) -> Sensors:
-    """The sensors of `config/sensors/<name>.yaml`, or of a file.
+    """Return the sensors of `config/sensors/<name>.yaml`, or of a file.
 
     Raises:
         ConfigError: no such file, or a value that is refused.
@@ -149,7 +149,7 @@ def check_quaternion(key: str, q: Quaternion) -> None:
     """Refuse a quaternion whose norm is not 1.
 
     Raises:
-        ConfigError: it is not; with the key.
+        ConfigError: the norm is not 1; the error names the key.
     """
     if not abs(np.linalg.norm(q) - 1.0) < 1e-3:
         raise ConfigError("", key, f"norm {np.linalg.norm(q):.4f} is not 1")

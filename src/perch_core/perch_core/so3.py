@@ -71,7 +71,7 @@ def quat_conjugate(q: Array) -> Array:
 
 
 def quat_rotate(q_AB: Array, v_B: Array) -> Array:
-    """Vector in A of a vector in B, shapes (..., 4) and (..., 3) -> (..., 3)."""
+    """Rotate vectors from B to A, shapes (..., 4) and (..., 3) -> (..., 3)."""
     q_AB, v_B = np.asarray(q_AB, float), np.asarray(v_B, float)
     u, w = q_AB[..., :3], q_AB[..., 3:]
     t = 2.0 * _cross(u, v_B)
@@ -79,7 +79,7 @@ def quat_rotate(q_AB: Array, v_B: Array) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """`np.cross` of vectors, shapes (..., 3), in a fifth of its time: it looks at axes and dimensions for 30 us."""
+    """`np.cross` of vectors, shapes (..., 3), in a fifth of its time, most of which (30 us) is the handling of axes."""
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     ax, ay, az, bx, by, bz = a[..., 0], a[..., 1], a[..., 2], b[..., 0], b[..., 1], b[..., 2]
     out[..., 0] = ay * bz - az * by
@@ -152,15 +152,15 @@ def quat_slerp(q0: Array, q1: Array, s: float | Array) -> Array:
 def yaw_of(R_WB: Array) -> Array:
     """Yaw with b2 parallel to (-sin yaw, cos yaw, 0) in the horizontal plane [rad]. [M:eq12]
 
-    Taken from b2, not b1: a vehicle that pitches to 90 degrees keeps its b2, its b1 becomes vertical.
+    Computed from b2, not b1: at a pitch of 90 degrees b2 is unchanged, while b1 is vertical.
     """
     R_WB = np.asarray(R_WB, float)
     return np.arctan2(-R_WB[..., 0, 1], R_WB[..., 1, 1])
 
 
 def nearest(A: Array) -> Array:
-    """The rotation next to a matrix, (3, 3), in the Frobenius norm: of a mean of rotations their chordal mean, of sum(a b^T) the R that
-    turns all b best into their a (Kabsch 1976)."""
+    """Return the rotation nearest to a matrix (3, 3) in the Frobenius norm: for a mean of rotations, their chordal mean; for
+    sum(a b^T), the R that best rotates each b to its a (Kabsch 1976)."""
     U, _, Vt = np.linalg.svd(A)
     R: Array = U * (1.0, 1.0, np.sign(np.linalg.det(U @ Vt))) @ Vt
     return R

@@ -1,4 +1,4 @@
-"""Where frames that do not move are in each other: `/tf_static` as the nodes need it."""
+"""Static transforms between frames, collected from `/tf_static`."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ MOST = 1000  # frames kept
 
 
 class StaticTransforms:
-    """A tree of frames, each with its place in its parent."""
+    """A tree of frames, each with its pose in its parent."""
 
     def __init__(self) -> None:
         self._placed: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # child -> parent, p, R
 
     def add(self, transform: Transform) -> str:
-        """Take a transform; the last one of a child counts.
+        """Add a transform; it replaces an earlier one of the same child.
 
         Returns:
-            Why it cannot be used; empty where it is taken.
+            Why it cannot be used; empty if it has been added.
         """
         name = f"transform {transform.parent!r} -> {transform.child!r}"
         values = (*transform.p, *transform.q)
@@ -40,7 +40,7 @@ class StaticTransforms:
         return ""
 
     def pose(self, child: str, parent: str = BASE) -> tuple[np.ndarray, np.ndarray] | None:
-        """Position (3,) [m] and attitude (3, 3) of `child` in `parent`; None where no chain leads from one to the other."""
+        """Position (3,) [m] and attitude (3, 3) of `child` in `parent`; None if the frames are not connected."""
         up, down = self._to_root(child), self._to_root(parent)
         common = next((frame for frame in up if frame in down), None)
         if common is None:
@@ -49,7 +49,7 @@ class StaticTransforms:
         return R_RP.T @ (p_RC - p_RP), R_RP.T @ R_RC
 
     def _to_root(self, frame: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """The pose of `frame` in itself and in each of its ancestors, nearest first."""
+        """Return the pose of `frame` in itself and in each of its ancestors, nearest first."""
         p, R = np.zeros(3), np.eye(3)
         poses = {frame: (p, R)}
         while frame in self._placed:

@@ -41,7 +41,7 @@ class PerchSurface:
     @classmethod
     def from_inclination(cls, p_WS: Array, inclination: float, heading: float = 0.0,
                          size: tuple[float, float] = (0.6, 0.6)) -> PerchSurface:
-        """The surface met when approaching along `heading`.
+        """Return the surface for an approach along `heading`.
 
         Args:
             p_WS: centre in W [m], shape (3,).

@@ -1,7 +1,7 @@
-"""Boards of AprilTags on the perching pad: where each tag's corners are in the surface frame S.
+"""Boards of AprilTags on the perching pad: positions of the tags' corners in the surface frame S.
 
-A board lists its tags, or is a grid as Kalibr prints it: `columns` x `rows` tags, their numbers growing along the rows from
-`first_id`, black squares of the gap's width between their corners, and a black border of two modules.
+A board is a list of tags, or a grid as Kalibr prints it: `columns` x `rows` tags, numbered along the rows from `first_id`,
+with black squares of the gap's width between their corners and a black border of two modules.
 
 Seen from outside with s1 up, the left is +s2. OpenCV's frame of a 36h11 marker is rotated by 180 deg against
 AprilTag's own: AprilTag's corners (lb, rb, rt, lt) are OpenCV's (TR, TL, BL, BR), and AprilTag counts pixels from
@@ -20,7 +20,7 @@ from perch_core import config
 from perch_core.errors import ConfigError
 
 FAMILIES = {"16h5": (4, 30), "25h9": (5, 35), "36h10": (6, 2320), "36h11": (6, 587)}
-"""The AprilTag families that OpenCV knows: modules of the code along a side, and how many tags there are."""
+"""AprilTag families that OpenCV supports: modules of the code along a side, and number of tags."""
 CORNER_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])  # TL, TR, BR, BL in (s1, s2)
 
 
@@ -48,7 +48,7 @@ class TagGrid:
 
     @property
     def tags(self) -> tuple[Tag, ...]:
-        """The tags, with the grid's centre in the origin."""
+        """The tags, with the grid's centre at the origin."""
         step = self.size * (1.0 + self.spacing)
         return tuple(Tag(self.first_id + row * self.columns + column,
                          (step * (row - 0.5 * (self.rows - 1)), -step * (column - 0.5 * (self.columns - 1))), self.size, self.rotation)
@@ -61,10 +61,10 @@ class TagBoard:
 
     Attributes:
         pad_size: full extent of the pad along s1 and s2 [m].
-        tags: the markers; those of `grid`, where that is given.
+        tags: the markers; those of `grid`, if one is given.
         family: marker family, one of `FAMILIES`.
         border: width of the tags' black border [modules]: 1, but 2 on Kalibr's AprilGrid.
-        corner_squares: black squares touch the tags at their corners, as on an AprilGrid.
+        corner_squares: whether black squares touch the tags at their corners, as on an AprilGrid.
         grid: tags in rows and columns, instead of a list.
     """
 
@@ -94,7 +94,7 @@ class TagBoard:
 
     @property
     def modules(self) -> int:
-        """Width of a tag between the outer edges of its border."""
+        """Width of a tag between the outer edges of its border [modules]."""
         return FAMILIES[self.family][0] + 2 * self.border
 
     @property
@@ -115,7 +115,7 @@ class TagBoard:
 
 
 def load_board(name_or_path: str | Path) -> TagBoard:
-    """Read `config/boards/<name>.yaml`, or the file named.
+    """Read `config/boards/<name>.yaml`, or a file.
 
     Raises:
         ConfigError: no such board, or a value that is not usable.

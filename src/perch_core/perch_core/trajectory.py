@@ -80,7 +80,7 @@ class FlatTrajectory:
     def _tables(self) -> Array:
         """All derivatives in the basis of one degree, so that a sample is one basis and one matrix product.
 
-        Made by the first sample: a planner that only publishes its coefficients does not pay for it.
+        Computed by the first sample, because a planner that only publishes its coefficients does not need it.
         """
         tables = np.empty((len(self.durations), _DERIVATIVES + 1, 4, self.degree + 1))
         for order in range(_DERIVATIVES + 1):
@@ -90,7 +90,7 @@ class FlatTrajectory:
 
     @cached_property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """As kernels take it: derivatives (n, 5, 4, degree + 1), segment ends (n + 1,) and durations (n,) [s], binomials."""
+        """Arguments of kernels: derivatives (n, 5, 4, degree + 1), segment ends (n + 1,) and durations (n,) [s], binomials."""
         return self._tables, np.array(self._edges), np.array(self.durations), bernstein.binomials(self.degree)
 
     @property
@@ -202,14 +202,14 @@ class SampledTrajectory:
                            between(self.rotor_thrust))
 
     def normalised(self) -> SampledTrajectory:
-        """The same with unit quaternions: those of a plan's samples are off by their rounding."""
+        """Return the trajectory with unit quaternions; those of a plan's samples have rounding errors."""
         return replace(self, q=self.q / np.linalg.norm(self.q, axis=1)[:, None])
 
     def rest_of(self, since: float, offset: Array) -> SampledTrajectory:
-        """What is left of it from a sample on, moved.
+        """Return the remainder from a sample on, shifted in position.
 
         Args:
-            since: time [s]; the rest begins with the last sample that is not later.
+            since: time [s]; the remainder begins with the last sample that is not later.
             offset: added to every position in W [m], shape (3,).
         """
         k = min(max(int(np.searchsorted(self.times, since, side="right")) - 1, 0), len(self.times) - 2)
@@ -218,7 +218,7 @@ class SampledTrajectory:
 
 
 def rest_to_rest(p0: Numbers, p1: Numbers, yaw0: float, yaw1: float, duration: float, start_time: float = 0.0) -> FlatTrajectory:
-    """Straight minimum-snap-like move between two hovers: degree 9, derivatives 1-4 vanish at both ends.
+    """Straight move between two hovers: a polynomial of degree 9, whose derivatives 1-4 vanish at both ends.
 
     Args:
         p0, p1: end positions in W [m], shape (3,).

@@ -1,4 +1,4 @@
-"""A vehicle file as URDF, of primitive shapes: what RViz, Foxglove and simulators know a vehicle by."""
+"""URDF of a vehicle file, with primitive shapes, for RViz, Foxglove and simulators."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def optical_frame(camera: str) -> str:
 
 
 def fixed_frames(vehicle: Vehicle) -> tuple[Transform, ...]:
-    """The frames that are fixed to the body: the IMU's and the cameras', in `base_link`, whose origin is the centre of mass."""
+    """Return the frames that are fixed to the body: IMU and cameras in `base_link`, whose origin is the centre of mass."""
     imu = Transform(BASE, IMU, vehicle.imu.position, (0.0, 0.0, 0.0, 1.0))
     cameras = (Transform(BASE, optical_frame(name), vector3(mount.p_BC), quaternion(so3.quat_from_matrix(mount.R_BC)))
                for name, mount in vehicle.mounts.items())
@@ -36,7 +36,7 @@ def fixed_frames(vehicle: Vehicle) -> tuple[Transform, ...]:
 
 
 def urdf(vehicle: Vehicle) -> str:
-    """The URDF of a vehicle: inertia and shapes in `base_link`, and a link for each fixed frame."""
+    """Return the URDF of a vehicle: inertia and shapes in `base_link`, and a link for each fixed frame."""
     robot = Element("robot", name=vehicle.name)
     for name, rgba in COLOURS.items():
         SubElement(SubElement(robot, "material", name=name), "color", rgba=rgba)
@@ -56,7 +56,7 @@ def urdf(vehicle: Vehicle) -> str:
 
 
 def roll_pitch_yaw(q: Sequence[float]) -> tuple[float, float, float]:
-    """A quaternion xyzw as URDF's fixed-axis angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Convert a quaternion xyzw to URDF's fixed-axis angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     R = so3.quat_to_matrix(np.array(q))
     c = hypot(R[0, 0], R[1, 0])
     pitch = atan2(-R[2, 0], c)
@@ -74,7 +74,7 @@ def _inertial(link: Element, vehicle: Vehicle) -> None:
 
 
 def _shapes(link: Element, vehicle: Vehicle) -> None:
-    """A core of half the body's size (all of it for collisions), arms, rotors (the front ones red) and the plate that touches."""
+    """Add a box of half the body's size (full size for collisions), arms, rotors (the front ones red) and the perching plate."""
     x, y, z = vehicle.body_radii
     _visual(link, "body", "body", "box", (0.0, 0.0, 0.0), size=_text((x, y, z)))
     collision = SubElement(link, "collision", name="body")

@@ -1,6 +1,6 @@
 """Vectors and quaternions as tuples of floats, for code that is compiled (see `jit`).
 
-At 500 Hz numpy's cost per call on three numbers would be most of the controller's time.
+At 500 Hz, numpy's overhead per call on three numbers would dominate the controller's computing time.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def norm(a: Numbers) -> float:
 
 @compiled
 def limited(a: Numbers, bound: float) -> Vector3:
-    """The vector, shortened to a length of at most `bound`."""
+    """Return the vector, shortened to a length of at most `bound`."""
     n = norm(a)
     if n > bound:
         return scale(bound / n, a)

@@ -1,4 +1,4 @@
-"""What a vehicle is: mass, rotors, sensors. One YAML file in `config/vehicles/` each."""
+"""Description of a vehicle: mass, rotors, sensors. Each vehicle is one YAML file in `config/vehicles/`."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class CameraConfig:
             raise ConfigError("", "transport_max", f"{self.transport_max:g} is below transport_min {self.transport_min:g}")
 
     def mount(self, name: str) -> CameraMount:
-        """The camera with its place on the body."""
+        """Return the camera with its pose on the body."""
         common = self.width, self.height, *self.focal, *self.centre
         camera: Camera = EquidistantCamera(*common, coefficients=self.distortion) if self.model == "equidistant" else PinholeCamera(*common)
         return CameraMount(
@@ -79,7 +79,7 @@ class ImuConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Battery:
-    """How the thrust at a throttle changes with the battery: thrust at `reference` (voltage / reference)^exponent."""
+    """Thrust at a given throttle as a function of the battery voltage: (thrust at `reference`) (voltage / reference)^exponent."""
 
     reference: float = quantity(0.0, unit="V", low=0.0, high=100.0, doc="at which the thrust curve holds; 0: the voltage is not looked at")
     exponent: float = quantity(2.0, low=0.5, high=4.0, doc="2: rotor speed proportional to voltage")
@@ -92,10 +92,11 @@ class Battery:
 
 @dataclass(frozen=True, kw_only=True)
 class Actuation:
-    """What the vehicle takes from the controller, and how what stands between that and the rotors answers.
+    """Commands that the vehicle takes from the controller, and the response of the inner loop between them and the rotors.
 
-    An inner loop is modelled by `w' = (rate_gain w_cmd - w) / rate_lag` on each axis and `T' = (thrust_gain T_cmd - T) / thrust_lag`, on
-    commands that are `delay` old; an attitude loop asks it for the rates that are fed forward + attitude error / `attitude_lag`.
+    An inner loop is modelled by `w' = (rate_gain w_cmd - w) / rate_lag` on each axis and
+    `T' = (thrust_gain T_cmd - T) / thrust_lag`, with commands delayed by `delay`; an attitude loop commands it the fed-forward
+    rates + attitude error / `attitude_lag`.
     """
 
     type: str = choice("rotor_speeds", options=("rotor_speeds", "rates_and_thrust", "attitude_and_thrust"))
@@ -116,7 +117,7 @@ class Actuation:
 
 @dataclass(frozen=True, kw_only=True)
 class ControlGains:
-    """How the vehicle is flown: gains of [M:eq2] per unit of mass and inertia, k_x = m position, k_v = m velocity, k_R = J attitude and
+    """Gains of [M:eq2] per unit of mass and inertia: k_x = m position, k_v = m velocity, k_R = J attitude and
     k_Omega = J rate."""
 
     position: Vector3 = quantity((7.0, 7.0, 9.0), unit="1/s^2", low=0.0, high=200.0, doc="axes of W")
@@ -179,7 +180,7 @@ class Vehicle:
 
     @cached_property
     def allocation(self) -> np.ndarray:
-        """Rotor thrusts -> (collective thrust, Mx, My, Mz), shape (4, 4). [defines P:eq2]"""
+        """Matrix from rotor thrusts to (collective thrust, Mx, My, Mz), shape (4, 4). [defines P:eq2]"""
         xy = np.array(self.rotor_xy)
         return np.stack([np.ones(4), xy[:, 1], -xy[:, 0], self.torque_ratio * np.array(self.rotor_yaw_sign, float)])
 
@@ -194,10 +195,10 @@ class Vehicle:
         return self.thrust_coefficient * self.speed_max**2
 
     def giving(self, ratio: float) -> Vehicle:
-        """The same vehicle, whose rotors give `ratio` times the thrust.
+        """Return the vehicle with rotors that produce `ratio` times the thrust.
 
         Raises:
-            ConfigError: it cannot fly.
+            ConfigError: such a vehicle cannot fly.
         """
         return self if ratio == 1.0 else replace(self, thrust_coefficient=ratio * self.thrust_coefficient)
 
@@ -208,22 +209,22 @@ class Vehicle:
 
     @property
     def wire_offset(self) -> float:
-        """Centre of mass from the axis of a wire, where a perch on it is planned to end [m]."""
+        """Planned distance of the centre of mass from the axis of a wire at the end of a perch [m]."""
         return self.perch_offset + self.stand_off
 
     @property
     def standing_height(self) -> float:
-        """Centre of mass above the ground on which the vehicle stands [m]."""
+        """Height of the centre of mass above the ground while the vehicle stands on it [m]."""
         return self.perch_offset - self.rest_sag
 
     @cached_property
     def mounts(self) -> dict[str, CameraMount]:
-        """The cameras with their places on the body, by name (`down`, `front`)."""
+        """The cameras with their poses on the body, by name (`down`, `front`)."""
         return {name: item.mount(name) for name, item in self.cameras.items()}
 
 
 def load_vehicle(name_or_path: str | Path) -> Vehicle:
-    """The vehicle of `config/vehicles/<name>.yaml`, or of a file, with all that it extends.
+    """Return the vehicle of `config/vehicles/<name>.yaml`, or of a file, merged with the files that it extends.
 
     Raises:
         ConfigError: no such vehicle, or a value that is refused.

@@ -1,7 +1,7 @@
-"""YAML into plain values, within declared limits: no file can crash its reader, keep it busy, or mean something else than it shows.
+"""Strict YAML parser with size limits: no file can crash its reader, occupy it for long, or be misread.
 
-A file is scanned as libyaml's events before anything is built of it, so that depth and size cost nothing; aliases count as
-what they stand for. Words are those of YAML 1.2 (`true`, `1e-3`; not `on`, not `1:30`), of which JSON is a part.
+A file is first scanned as libyaml's events, so that excessive depth and size are refused before any value is built; an alias
+counts as the values that it refers to. Scalars follow YAML 1.2 (`true`, `1e-3`; not `on`, not `1:30`), which includes JSON.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _whole)
 
 
 def read_yaml(path: Path | str) -> Any:
-    """What a file holds, see `parse_yaml`.
+    """Read a YAML file; see `parse_yaml`.
 
     Raises:
-        ConfigError: it cannot be read, or is refused.
+        ConfigError: the file cannot be read, or its content is refused.
     """
     try:
         with open(path, "rb") as file:
@@ -66,14 +66,14 @@ def read_yaml(path: Path | str) -> Any:
 
 
 def parse_yaml(text: str, source: str) -> Any:
-    """Mappings, lists, text, numbers, booleans and None.
+    """Parse YAML into mappings, lists, text, numbers, booleans and None.
 
     Args:
         text: YAML or JSON.
         source: file or option, for messages.
 
     Raises:
-        ConfigError: not YAML, a key twice, a tag, or beyond the limits.
+        ConfigError: invalid YAML, a duplicate key, a tag, or content beyond the limits.
     """
     try:
         _scan(text, source)
@@ -83,7 +83,7 @@ def parse_yaml(text: str, source: str) -> Any:
 
 
 class _Open:
-    """A list or mapping whose end has not come."""
+    """A list or mapping whose end event has not been read."""
 
     def __init__(self, event: NodeEvent, before: int) -> None:
         self.anchor, self.before, self.height, self.entries = event.anchor, before, 1, 0
@@ -91,7 +91,7 @@ class _Open:
 
 
 def _scan(text: str, source: str) -> None:
-    """Refuse what must not be built."""
+    """Refuse duplicate keys, tags and excessive content before any value is built."""
     nodes = 0
     path: list[_Open] = []
     anchors: dict[str, tuple[int, int]] = {}  # name -> values, levels

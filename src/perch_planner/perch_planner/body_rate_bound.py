@@ -1,13 +1,13 @@
-"""A proved bound on the body rate that flatness commands. [M:eq13]
+"""A proved bound on the body rate of a plan, from differential flatness. [M:eq13]
 
 With f = a + g e3, j the jerk and x = f x j, and d = b2_des of the yaw psi,
 
     w_x^2 + w_y^2 = |x|^2 / |f|^4                                                   (Lagrange's identity on [M:eq10])
     w_z = (psi' f_z |f| + (d . f)(d . x) / |f|) / (|f|^2 - (d . f)^2)                             (from [M:eq12])
 
-The tilt part is a quotient of polynomials of degree 48: `|x|^2 <= u |f|^4` is one polynomial inequality, decided by
-its Bernstein coefficients. The spin part holds sines of a polynomial: it is bounded on each subinterval from the
-enclosures of its parts and taken off the squared limit, u = W^2 - w_z^2.
+The tilt part is a quotient of polynomials of degree 48: `|x|^2 <= u |f|^4` holds on a subinterval where u is the largest
+quotient of their Bernstein coefficients. The spin part contains sines of a polynomial: it is bounded on each subinterval
+from the enclosures of its parts, and added in squares, |omega|^2 <= u + w_z^2.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _PARTS = len(_SIZES)
 
 @compiled
 def rate_parts(force: Array, force2: Array, jerk: Array, yaw: Array, duration: float) -> Array:
-    """Bernstein coefficients of what the body rate consists of.
+    """Bernstein coefficients of the polynomials in the body rate.
 
     Args:
         force, force2: f and |f|^2, shapes (3, 13) and (25,) [m/s^2].
@@ -72,7 +72,7 @@ def rate_parts(force: Array, force2: Array, jerk: Array, yaw: Array, duration: f
 
 @compiled
 def rate_coarse_bound(force: Array, force2: Array, jerk: Array, yaw: Array, duration: float) -> float:
-    """A quick upper bound of |omega| on a segment from |x| <= |f| |j|; infinite where it is of no use.
+    """A quick upper bound of |omega| on a segment from |x| <= |f| |j|; infinite where the bound fails.
 
     Args:
         force, force2, jerk, yaw, duration: as for `rate_parts`.
@@ -97,7 +97,7 @@ def rate_coarse_bound(force: Array, force2: Array, jerk: Array, yaw: Array, dura
 
 @compiled
 def spin_rate(f_x: float, f_y: float, f_z: float, x_x: float, x_y: float, yaw: float, yaw_rate: float) -> float:
-    """w_z for components of f and x = f x j [rad/s]; large where f lies along b2_des, which leaves b3 without a heading."""
+    """w_z for components of f and x = f x j [rad/s]; large where f is parallel to b2_des and the heading is undefined."""
     specific = sqrt(max(f_x * f_x + f_y * f_y + f_z * f_z, 1e-12))
     d_x, d_y = -sin(yaw), cos(yaw)
     lean = d_x * f_x + d_y * f_y
@@ -116,7 +116,7 @@ def squared_rate(f_x: float, f_y: float, f_z: float, j_x: float, j_y: float, j_z
 
 @compiled
 def _squared_rate(parts: Array) -> float:
-    """|omega|^2 where the parts begin."""
+    """|omega|^2 at the start of the interval of the parts."""
     spin = spin_rate(parts[3, 0], parts[4, 0], parts[5, 0], parts[6, 0], parts[7, 0], parts[9, 0], parts[10, 0])
     tilt: float = parts[1, 0] / max(parts[0, 0], 1e-60)
     return tilt + spin * spin
@@ -187,13 +187,13 @@ def rate_maximum(parts: Array, attained: float, limit: float) -> tuple[float, fl
 
     Args:
         parts: of `rate_parts`.
-        attained: a rate that the plan attains anyhow [rad/s].
-        limit: where the decision has to be exact [rad/s].
+        attained: a rate that the plan attains elsewhere [rad/s].
+        limit: of the rate, against which the decision is exact [rad/s].
 
     Returns:
-        (attained, proved, place): the largest rate that is known to be attained, at `place` of this segment or, with place
-        -1, elsewhere; and a proved upper bound, 4 % above it at most, and not above a limit that is kept. The search ends
-        when the limit is broken: then `proved` is infinite, as it is where nothing can be proved near `place`.
+        (attained, proved, place): the largest attained rate found, at `place` of this segment or, with place -1, elsewhere;
+        and a proved upper bound, at most 4 % above it and within a limit that holds. `proved` is infinite where the limit
+        is violated, which ends the search, or where the proof fails near `place`.
     """
     stack = np.empty((_DEPTH + 2, _PARTS, _TILT))
     start = np.zeros(_DEPTH + 2)
@@ -232,13 +232,13 @@ def rate_maximum(parts: Array, attained: float, limit: float) -> tuple[float, fl
 @compiled
 def prove_rate(forces: Array, squares: Array, jerks: Array, yaw: Array, durations: Array, coarse: Array, limit: float, sampled: float
                ) -> tuple[float, int, float, int, float]:
-    """Prove a body rate near the greatest that is attained, or find where the limit fails.
+    """Prove a bound of the body rate near the greatest attained one, or find where the limit fails.
 
     Args:
         forces, squares, jerks, yaw, durations: of all segments, as for `rate_parts`.
-        coarse: of `rate_coarse_bound`, shape (f,) [rad/s].
+        coarse: from `rate_coarse_bound`, shape (f,) [rad/s].
         limit: of the rate [rad/s].
-        sampled: a rate below the limit that the plan is known to attain [rad/s].
+        sampled: an attained rate below the limit [rad/s].
 
     Returns:
         (proved, doubt, doubt_at, found, found_at): the proved bound, or infinity and segment and place where the limit is in

@@ -56,7 +56,7 @@ def magnitude(values: Array) -> float:
 def split(work: Array, left: Array) -> None:
     """De Casteljau at 1/2: the left half is written to `left`, and `work` becomes the right half.
 
-    Four levels in one pass: a pass for each level waits for its own stores, and takes three times as long.
+    Four levels are computed in one pass: single-level passes stall on their own stores and take three times as long.
     """
     n, k = len(work), 0
     while k + 3 < n:
@@ -137,7 +137,7 @@ def maximum(coefficients: Array, tolerance: float, floor: float) -> tuple[float,
     Args:
         coefficients: Bernstein coefficients, shape (n + 1,).
         tolerance: wanted width of the enclosure, in the polynomial's unit.
-        floor: values below it are of no interest (-inf: all are).
+        floor: values below it need not be enclosed; -inf: all values are.
 
     Returns:
         (attained, proved, place): a value that is attained at `place`, and a proved upper bound;
@@ -195,7 +195,7 @@ def bernstein_row(degree: int, s: float) -> Array:
 
 @compiled
 def _scaled(a: Array) -> Array:
-    """Coefficients times binomials: so scaled, a product is a convolution."""
+    """Coefficients times binomials, for which a product is a convolution."""
     n = len(a)
     out = np.empty(n)
     for i in range(n):
@@ -274,7 +274,7 @@ def time_derivative(coefficients: Array, order: int, duration: float) -> Array:
 
 @compiled
 def squared(a: Array) -> Array:
-    """Bernstein coefficients of |a|^2 for a polynomial vector, shape (3, n + 1) -> (2 n + 1,): half the products."""
+    """Bernstein coefficients of |a|^2 for a polynomial vector, shape (3, n + 1) -> (2 n + 1,), with half the products."""
     n = a.shape[1]
     out, scaled = np.zeros(2 * n - 1), np.empty(n)
     for d in range(a.shape[0]):

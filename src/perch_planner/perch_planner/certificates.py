@@ -1,4 +1,4 @@
-"""Bounds that a plan carries with it, in the units of their quantities."""
+"""Certificates of a plan: its bounds, in the units of their quantities."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from perch_planner.search import Outcome, Search
 
 
 def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Certificate, ...]:
-    """The certificates of `plan_checks.check`.
+    """Convert results of `plan_checks.check` into certificates.
 
     Args:
-        results: rows of `plan_checks.NAMES`, shape (5, 5), or (6, 5) where the rotors were looked at.
-        limits: what was required.
-        mass: turns specific thrust into thrust [kg].
+        results: rows of `plan_checks.NAMES`, shape (5, 5), or (6, 5) where the rotors were checked.
+        limits: the required limits.
+        mass: factor from specific thrust to thrust [kg].
     """
     inf = float("inf")
     table = (("N", *limits.thrust, mass, "bernstein"), ("m/s", -inf, limits.speed, 1.0, "bernstein"),
@@ -36,7 +36,7 @@ def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Cert
 
 @compiled
 def _impact(coefficients: Array, durations: Array, v_S: Array, s3: Array) -> tuple[float, float]:
-    """Speed along -s3 at the end of a plan, relative to the surface [m/s], and the time of the end [s]; arguments of `plan_checks.check`."""
+    """Final speed along -s3, relative to the surface [m/s], and its time [s]; arguments as for `plan_checks.check`."""
     last, speed = coefficients[-1], 0.0
     degree = last.shape[1] - 1
     for d in range(3):
@@ -45,13 +45,13 @@ def _impact(coefficients: Array, durations: Array, v_S: Array, s3: Array) -> tup
 
 
 def perch_certificates(search: Search, outcome: Outcome) -> tuple[Certificate, ...]:
-    """The certificates of a perch: those of `certificates`, and the speed along -s3 at the planned contact, relative to the surface. [M:eq14]
+    """Certificates of a perch: those of `certificates`, and the speed along -s3 at the planned contact, relative to S. [M:eq14]
 
-    Both bounds of the speed may be one value, which a plan meets to rounding: it may be `INSET` beyond them.
+    The bounds of the speed may be equal, and a plan meets them only to rounding: it may exceed them by `INSET`.
 
     Args:
-        search: for the problem and its limits.
-        outcome: of durations, or the plan; where its limits were not checked, there are no certificates.
+        search: provides the problem and its limits.
+        outcome: result of the search; where its limits were not checked, there are no certificates.
     """
     if not len(outcome.results):
         return ()

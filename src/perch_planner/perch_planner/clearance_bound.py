@@ -24,7 +24,7 @@ def surface_distance(coefficients: Array, duration: float, begin: float, p_S: Ar
 
 @compiled
 def _rim_clears(distance: Array, force: Array, force2: Array, s3: Array, extension: float, gap: float) -> tuple[bool, float]:
-    """Whether distance - extension sin(tilt) > gap is proved on the segment, and a place where it is doubtful.
+    """Return whether distance - extension sin(tilt) > gap is proved on the segment, and a place where the proof fails.
 
     The rim of a disc around the centre of mass reaches extension sin(tilt) towards the surface, and
     sin(tilt) = |f x s3| / |f|: so (distance - gap)^2 |f|^2 > extension^2 |f x s3|^2 with distance > gap.
@@ -45,18 +45,18 @@ def _rim_clears(distance: Array, force: Array, force2: Array, s3: Array, extensi
 @compiled
 def prove_clearance(distances: Array, forces: Array, squares: Array, s3: Array, extension: float, limit: float, sampled: float
                     ) -> tuple[float, int, float]:
-    """Prove a clearance near the sampled one, or else that the limit holds, or else find where it fails.
+    """Prove a clearance near the sampled one, else that the limit holds, else find where the proof fails.
 
     Args:
-        distances: of `surface_distance`, shape (f, 15) [m].
+        distances: from `surface_distance`, shape (f, 15) [m].
         forces, squares: f and |f|^2, shapes (f, 3, 13) and (f, 25).
         s3: outward normal, shape (3,).
         extension: radius of the vehicle's disc [m].
         limit: least distance of its rim from the surface [m].
-        sampled: a distance that the plan is known to attain [m].
+        sampled: an attained clearance [m].
 
     Returns:
-        (proved, segment, place): the proved clearance, or -inf and where it is doubtful; segment -1 where there is no doubt.
+        (proved, segment, place): the proved clearance, or -inf and where the proof fails; segment -1 where it succeeds.
     """
     failed, place = -1, 0.0
     for gap in (sampled - 0.02 * abs(sampled) - 1e-3, sampled - 0.1 * abs(sampled) - 5e-3, limit):

@@ -14,8 +14,8 @@ from perch_planner.linear_bounds import BoundArrays
 from perch_planner.problem import PerchProblem, PerchSettings
 
 INSET = 1e-7
-"""Bounds are tightened by this [SI]: more than the solvers leave of a row (1e-9 of its length with DAQP, 1e-8 with OSQP). What counts as
-solved (`solvers.FEASIBILITY`) may be more: the certificate of the impact speed is computed from the plan itself."""
+"""Tightening of the bounds [SI], more than the residual that solvers leave (1e-9 of a row's length with DAQP, 1e-8 with OSQP).
+`solvers.FEASIBILITY` permits a larger residual: the certificate of the impact speed is computed from the plan itself."""
 
 TUBE_STEP = 0.01    # dt of [M:eq15] [s]
 TUBE_SHARE = 0.1    # q of [M:eq15]
@@ -29,12 +29,12 @@ _OCTAGON = np.array([[cos(k * pi / _FACETS), sin(k * pi / _FACETS)] for k in ran
 @compiled
 def _bounds(durations: Array, before_end: Array, tube_lower: Array, tube_upper: Array, window: Array, window_lower: Array,
             window_upper: Array) -> BoundArrays:
-    """Tube rows for each instant and axis, then the window's rows: fields of `Bounds`. Instants before the start are dropped.
+    """Fields of `Bounds`: tube rows for each instant and axis, then rows of the window. Instants before the start are dropped.
 
     Args:
         durations: of the segments [s], shape (f,).
-        before_end: instants of the tube, counted from the end [s], ascending, shape (k,).
-        tube_lower, tube_upper: of `tube_bounds`, shape (3,).
+        before_end: instants of the tube, relative to the end [s], ascending, shape (k,).
+        tube_lower, tube_upper: from `tube_bounds`, tightened, shape (3,).
         window, window_lower, window_upper: directions and bounds of the velocity at contact, shapes (w, 3), (w,), (w,).
     """
     last, end = len(durations) - 1, durations.sum()
@@ -81,9 +81,9 @@ def tube_bounds(end_acceleration: Array, share: float, floor: float) -> tuple[Ar
 def _window(R_WS: Array, velocity: Array, later: Array, least: float, most: float, tangential: float) -> tuple[Array, Array, Array]:
     """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [defines M:eq14]
 
-    They hold for a contact on time and for one that comes late, after a change of the velocity by `later` [m/s], shape (3,).
-    Where no velocity meets its bounds at both times, the change counts as far as they are wide: a contact on time is then at the
-    edge of its own bounds that is nearest to those of the late one.
+    They hold for a contact on time and for a delayed one, after a change of the velocity by `later` [m/s], shape (3,). Where no
+    velocity satisfies the bounds at both times, the change is limited to their width: the velocity of a contact on time then
+    lies on the edge of its bounds that is nearest to those of the delayed one.
     """
     count = 1 + len(_OCTAGON)
     directions, lower, upper, changes = np.empty((count, 3)), np.empty(count), np.empty(count), np.zeros(count)
@@ -110,7 +110,7 @@ def _window(R_WS: Array, velocity: Array, later: Array, least: float, most: floa
 
 @compiled
 def _knots(durations: Array, given: Flags, values: Array, velocity: Array) -> tuple[Flags, Array]:
-    """What is given at the knots; those between the last waypoint and contact are free."""
+    """Flags and values of the conditions at the knots; knots between the last waypoint and contact are free."""
     f, last = len(durations), len(given) - 1
     out, at = np.zeros((f + 1, 4), np.bool_), np.zeros((f + 1, 4, 3))
     for i in range(last + 1):
@@ -127,7 +127,7 @@ def _knots(durations: Array, given: Flags, values: Array, velocity: Array) -> tu
 
 @compiled
 def _bubbles(count: int, given: Flags, first_in_tube: int, everywhere: bool) -> Flags:
-    """Which segments have bubbles: those of the tube, and those after a waypoint at which everything is given, or all."""
+    """Flags of the segments with bubbles: those of the tube and those after a waypoint with all derivatives given, or all."""
     out = np.zeros(count, np.bool_)
     for i in range(count):
         out[i] = everywhere or i >= first_in_tube
@@ -139,7 +139,7 @@ def _bubbles(count: int, given: Flags, first_in_tube: int, everywhere: bool) -> 
 
 @compiled
 def tube_times(tube_time: float, tube_step: float) -> Array:
-    """The instants -t_k + j dt, 0 <= j < t_k / dt, of the tube, from the contact on [s]. [M:eq15]"""
+    """Instants -t_k + j dt, 0 <= j < t_k / dt, of the tube, relative to the contact [s]. [M:eq15]"""
     count = int(np.ceil(tube_time / tube_step - 1e-9))
     out = np.empty(count)
     for j in range(count):
@@ -151,11 +151,11 @@ def tube_times(tube_time: float, tube_step: float) -> Array:
 def _contact(points: Array, v: Array, a: Array, j: Array, places: Indices, orders: Indices, fixed: Array, R_WS: Array, velocity: Array,
              alpha: float, share: float, floor: float, tube_time: float, tube_step: float, delay: float, least: float, most: float, tangential: float
              ) -> tuple[Flags, Array, tuple[Array, Array, Array, Array, Array, Array]]:
-    """Knots, tube and window of a problem, for a target that stands still. [defines M:eq11]
+    """Knots, tube and window of a problem, with the contact position of a static target. [defines M:eq11]
 
     Returns:
-        (given, values, before_contact): what is given at start, waypoints and contact, shapes (k, 4) and (k, 4, 3), and
-        arguments of `_bounds`.
+        (given, values, before_contact): flags and values of the conditions at start, waypoints and contact, shapes (k, 4)
+        and (k, 4, 3), and arguments of `_bounds`.
     """
     acceleration, last = np.empty(3), len(points) - 1
     for d in range(3):
@@ -177,9 +177,9 @@ def _contact(points: Array, v: Array, a: Array, j: Array, places: Indices, order
 def conditions(durations: Array, everywhere: bool, velocity: Array, problem: tuple[Any, ...]) -> tuple[Flags, Array, Flags, BoundArrays]:
     """Knots [M:eq6, M:eq11], tube [M:eq15] and window [M:eq14] for given durations.
 
-    A moving target is met where it is at the end. Where there are more durations than segments of the problem, nothing is
-    given at the knots between the last waypoint and contact. The approach runs along -s3, the *outward* normal, so the
-    window reads v_min <= -v(t_f) . s3 <= v_max; all velocities are relative to the surface.
+    The contact with a moving target is at its position at the end. Where there are more durations than segments of the
+    problem, the knots between the last waypoint and contact have no conditions. The approach runs along -s3, where s3 is the
+    *outward* normal, so the window reads v_min <= -v(t_f) . s3 <= v_max; all velocities are relative to the surface.
 
     Args:
         durations: of the segments [s], shape (f,).
@@ -197,11 +197,11 @@ def conditions(durations: Array, everywhere: bool, velocity: Array, problem: tup
 
 
 class Contact:
-    """What does not change while durations are stretched; made once per plan.
+    """Data of a problem that do not depend on the durations; built once per plan.
 
     Attributes:
         velocity: of the target in W [m/s], shape (3,).
-        points: start, waypoints, and the contact if the target stood still [m], shape (waypoints + 2, 3).
+        points: start, waypoints, and the contact with a static target [m], shape (waypoints + 2, 3).
         problem: arguments of `_contact`.
     """
 

@@ -1,8 +1,8 @@
 """Linear bounds that steer the next quadratic program away from a violated limit.
 
-A limit on a norm from above, |u| <= b, is convex: `n . u <= b` with n = u / |u| cuts the present plan off and no plan
-that keeps the limit. So do height and the surface's plane. The thrust from below, the rim and the body rate are not
-convex; their cuts are a choice of side. No plan is believed because of its cuts: every limit is proved afterwards.
+An upper limit on a norm, |u| <= b, is convex: `n . u <= b` with n = u / |u| excludes the present plan and no plan that
+keeps the limit. The same holds for height and the surface's plane. The limits of the least thrust, the rim and the body
+rate are not convex; their cuts select one side. Cuts prove nothing: every limit is checked afterwards.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FLAT = 0.97        # of the limit; a peak is cut beside its place where the thr
 
 @compiled
 def _specific_force(coefficients: Array, duration: float, place: float) -> tuple[float, float, float, float]:
-    """f = a + g e3 at one place of a segment as three floats, and its length [m/s^2]."""
+    """Specific force f = a + g e3 at one place of a segment, as three floats, and its norm [m/s^2]."""
     f = derivatives_at(coefficients, duration, place, 3)[2]
     f_z = f[2] + GRAVITY
     return f[0], f[1], f_z, np.sqrt(f[0] * f[0] + f[1] * f[1] + f_z * f_z)
@@ -44,9 +44,9 @@ def thrust_cuts(coefficients: Array, durations: Array, extrema: Array, low: floa
     Args:
         coefficients: shape (f, 3, 15).
         durations: shape (f,) [s].
-        extrema: of `plan_checks.thrust_extrema`.
+        extrema: result of `plan_checks.thrust_extrema`.
         low, high: limits of the specific thrust [m/s^2].
-        side: unit vector over which the thrust turns where it nearly vanishes, shape (3,).
+        side: unit vector of the cut where the thrust nearly vanishes, shape (3,).
 
     Returns:
         Fields of `Bounds`.
@@ -82,7 +82,7 @@ def thrust_cuts(coefficients: Array, durations: Array, extrema: Array, low: floa
 
 
 def turning_side(heading: float) -> Array:
-    """Direction over which the thrust turns from up to s3: against the heading of the approach [rad], shape (3,)."""
+    """Unit vector through which the thrust turns from upward to s3: opposite to the approach heading [rad], shape (3,)."""
     return np.array([-cos(heading), -sin(heading), 0.0])
 
 
@@ -92,7 +92,7 @@ def limit_cuts(where: Array, coefficients: Array, yaw: Array, durations: Array, 
     """Cuts where speed, height, clearance or body rate could not be proved.
 
     Args:
-        where: of `plan_checks.check`.
+        where: places of doubt, from `plan_checks.check`.
         coefficients, yaw, durations: the plan.
         p_S, v_S, s3, low_height, high_height, speed, rate, extension: as for `plan_checks.check`.
 

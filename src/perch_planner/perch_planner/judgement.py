@@ -1,4 +1,4 @@
-"""What the plan of one program is worth: every limit proved or in doubt, and cuts against what is found, in one call."""
+"""Evaluation of the plan of one program in one call: proofs or doubts of every limit, and cuts against violations."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _LOOK = 0.9       # of the least thrust: where the first plan's is greater, its 
 
 
 class Question(NamedTuple):
-    """What a plan is judged by.
+    """Limits and surface against which a plan is checked.
 
     Attributes:
         p_S, v_S, s3: point of the surface at time 0 [m], its velocity [m/s], outward normal, each shape (3,).
-        side: of `cutting.turning_side`, shape (3,).
+        side: from `cutting.turning_side`, shape (3,).
         low_thrust, high_thrust: limits of the specific thrust [m/s^2].
         speed: limit [m/s].
         low_height, high_height: limits of the height [m].
         extension, clearance: radius of the vehicle's disc, least distance of its rim from the surface [m].
         rate: limit of |omega| [rad/s].
-        near: a thrust outside its range by less is cut together with the other limits [m/s^2].
-        waypoints: peaks of the thrust in so many segments are stretched rather than cut; those after them only where they
-            are high.
+        near: violations of the thrust range below this are cut together with the other limits [m/s^2].
+        waypoints: their number; thrust peaks in as many first segments are stretched rather than cut, later ones only where
+            they are high.
     """
 
     p_S: np.ndarray
@@ -51,19 +51,19 @@ class Question(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """What was found.
+    """Result of the check of a plan.
 
     Attributes:
         coefficients: of the plan, shape (f, 3, 15) [m].
-        extrema: of `plan_checks.thrust_extrema`.
+        extrema: from `plan_checks.thrust_extrema`.
         results: rows of `plan_checks.NAMES`, meaningless unless `checked`.
         least, most: proved extrema of the specific thrust [m/s^2].
-        checked: the limits beside the thrust were looked at.
-        kept: no rotor is known to leave its range.
-        holds: all limits are proved, if `kept` those of the rotors, too.
-        stretch: a longer time promises more than cuts, and there are none.
-        cuts: linear bounds that were found beside those of rotors.
-        near: bounds of rotors that hold near the plan alone.
+        checked: the limits other than the thrust were checked.
+        kept: no violation of the rotor range was found, and its proof did not fail.
+        holds: all limits but the rotor range are proved; with `kept`, the rotor range too.
+        stretch: longer durations promise more than cuts, and no cuts were made.
+        cuts: number of linear bounds found, without those of the rotors.
+        near: number of rotor bounds, which are valid near the plan only.
     """
 
     coefficients: np.ndarray
@@ -81,7 +81,7 @@ class Judgement(NamedTuple):
 
 @compiled
 def _better_stretched(extrema: Array, high: float, waypoints: int) -> bool:
-    """Whether the thrust's peak lies where a longer time lowers it."""
+    """Whether the thrust peak is to be lowered by longer durations rather than by cuts."""
     segment = extrema[:, 4].argmax()
     peak = extrema[segment, 4]
     return bool(peak > high and (segment < waypoints or peak > _CUT_REACH * high))
@@ -90,21 +90,22 @@ def _better_stretched(extrema: Array, high: float, waypoints: int) -> bool:
 @compiled
 def judge(coefficients: Array, yaw: Array, heading: Array, durations: Array, question: tuple[Any, ...], rotors: Rotors, patient: bool,
           later: bool) -> tuple[Array, Array, tuple[float, float, bool, bool, bool, bool], BoundArrays, BoundArrays, Array]:
-    """Check a plan, and find cuts against what breaks a limit.
+    """Check a plan, and find cuts against violated limits.
 
     Args:
         coefficients: of the position, shape (f, 3, 15) [m].
         yaw: of the heading, shape (f, 15) [rad].
-        heading: of `rotor_thrusts.plan_headings`.
+        heading: from `rotor_thrusts.plan_headings`.
         durations: shape (f,) [s].
         question: fields of `Question`.
         rotors: their limits and model.
-        patient: give up where longer durations promise more than cuts.
-        later: this is not the first program: where the thrust is nearly in its range, the other limits count too.
+        patient: set `stretch` where longer durations promise more than cuts.
+        later: this is not the first program: the other limits are also checked where the thrust is nearly in its range.
 
     Returns:
-        (extrema, results, (least, most, checked, kept, holds, stretch), thrust, other, thrusts): as in `Judgement`; cuts of the thrust
-        and of the other limits, fields of `Bounds`; of `rotor_thrusts.sampled`, empty where the rotors were not looked at.
+        (extrema, results, (least, most, checked, kept, holds, stretch), thrust, other, thrusts): the first three as in
+        `Judgement`; thrust, other: cuts of the thrust and of the other limits, fields of `Bounds`; thrusts: from
+        `rotor_thrusts.sampled`, empty where the rotors were not checked.
     """
     p_S, v_S, s3, side, low, high, speed, low_height, high_height, extension, clearance, rate, near, waypoints = question
     extrema, least, most = thrust_extrema(coefficients, durations, low, high)

@@ -1,4 +1,4 @@
-"""Linear bounds on derivatives at single places of a plan: what every formulation of the program understands."""
+"""Linear bounds on derivatives at single places of a plan, independent of the formulation of the program."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ BoundArrays = tuple[Indices, Indices, Array, Indices, Array, Array, Array]
 class Bounds(NamedTuple):
     """Linear bounds at single places of the plan: lower <= sum of direction . (order-th derivative) <= upper.
 
-    Terms of one derivative at one place that follow each other are computed once.
+    Successive terms of the same derivative at the same place are evaluated once.
 
     Attributes:
-        owner: bound to which each term adds, shape (t,).
-        segments, places, orders: where a term is taken, place in [0, 1] of the segment, and its time derivative, 0
-            position to 4 snap; each shape (t,).
+        owner: index of the bound to which each term adds, shape (t,).
+        segments, places, orders: segment of each term, place in [0, 1] on it, and order of the time derivative, from 0
+            for position to 4 for snap; each shape (t,).
         direction: vector in W of each term, shape (t, 3).
         lower, upper: bounds of the sums, infinite where there is none, shape (r,).
     """
@@ -37,6 +37,6 @@ class Bounds(NamedTuple):
 
 @compiled
 def no_bounds(terms: int, rows: int) -> BoundArrays:
-    """Arrays of `Bounds` to be filled in: so many terms of weight zero, so many rows without bounds."""
+    """Return arrays of `Bounds` to be filled in, with `terms` terms of weight zero and `rows` rows without bounds."""
     return (np.zeros(terms, np.int64), np.zeros(terms, np.int64), np.zeros(terms), np.full(terms, 2), np.zeros((terms, 3)),
             np.full(rows, -np.inf), np.full(rows, np.inf))

@@ -1,4 +1,4 @@
-"""The perching planner as a component: services `plan_perch` and `plan_way_out`, requests to plans or typed refusals. [M:IV-C]"""
+"""Perching planner component: answers requests of `plan_perch` and `plan_way_out` with plans or typed refusals. [M:IV-C]"""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class PerchingPlannerParameters(PerchParameters):
 
     @property
     def settings(self) -> PerchSettings:
-        """Those of the planner."""
+        """Parameters of the planner as settings of a plan."""
         return PerchSettings(**{field.name: getattr(self, field.name) for field in fields(PerchParameters)})
 
 
@@ -71,16 +71,17 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         self._vehicle = load_vehicle(config.vehicle)
 
     def preload(self) -> Callable[[], None]:
-        """Load or compile the kernels."""
+        """Return the function that loads or compiles the kernels."""
         return partial(_load, self.config.settings, self._vehicle)
 
     def on_plan_perch(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
-        """Plan, and reply when there is an answer."""
+        """Plan a perch, and reply with the plan or a refusal."""
         self._plan(planner.plan, request, reply)
 
     def on_plan_way_out(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
-        """Plan from the start to a hover in front of the surface; waypoints, times and the impact's options must be those of a perch, and are
-        not used."""
+        """Plan from the start to a hover in front of the surface.
+
+        Waypoints, segment times and impact options are validated as for a perch, but ignored."""
         self._plan(plan_way_out, request, reply)
 
     def _plan(self, method: Method, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
@@ -97,7 +98,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         self.work(Job(solve, arguments, answer, limit, isolated=True))
 
     def _answer(self, perch: bool, request: PerchPlanRequest, reply: Callable[[PerchPlan], None], limit: float, found: Any) -> None:
-        """Reply with a plan, or with the error that there is in its place."""
+        """Reply with a plan, or with the error that occurred instead."""
         if isinstance(found, planner.PerchPlan):
             answer = perch_plan(found, request, CONTACT_TIME if perch else 0.0)
         else:
@@ -111,7 +112,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
 
 
 def _load(settings: PerchSettings, vehicle: Vehicle) -> None:
-    """Plan once, so that the kernels are there before the first request."""
+    """Plan once with each method, so that the kernels are compiled before the first request."""
     surface = PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), math.radians(60.0))
     try:
         for method in (planner.plan, plan_way_out):
@@ -121,10 +122,10 @@ def _load(settings: PerchSettings, vehicle: Vehicle) -> None:
 
 
 def solve(method: Method, problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> planner.PerchPlan:
-    """Plan by `planner.plan` or `plan_way_out`; the job of a request.
+    """Plan by `planner.plan` or `plan_way_out`, as the job of a request.
 
     Raises:
-        PerchRefusal: there is no plan; code solver where the numerics failed in a way that nobody had foreseen.
+        PerchRefusal: no plan was found; code `solver` after an unexpected error.
     """
     try:
         return method(problem, settings, vehicle)
@@ -135,10 +136,10 @@ def solve(method: Method, problem: PerchProblem, settings: PerchSettings, vehicl
 
 
 def perch_problem(request: PerchPlanRequest) -> PerchProblem:
-    """The problem of a request.
+    """Convert a request into a planning problem.
 
     Raises:
-        ConfigError: a start outside `current`.
+        ConfigError: `current` carries samples or is out of range, or the start lies outside it.
     """
     norm = float(np.linalg.norm(request.q_WS))  # what is normalised already stays as it is to the last bit
     q_WS = np.asarray(request.q_WS, float) / (norm if abs(norm - 1.0) > 1e-9 else 1.0)
@@ -157,11 +158,11 @@ def perch_problem(request: PerchPlanRequest) -> PerchProblem:
 
 
 def perch_settings(request: PerchPlanRequest, settings: PerchSettings, surface: PerchSurface) -> PerchSettings:
-    """Settings for a surface, with the options of a request in their place.
+    """Return the settings for a surface, with the options of a request applied.
 
-    A surface that faces up is fallen onto, and what falls through the whole tube with g s3_z - alpha has risen from below the surface
-    before, unless alpha leaves so much that v_n is not yet reversed at the tube's beginning. Where nobody asks for another, half of
-    v_min is left there: alpha >= g s3_z - v_min / 2 (t_k + contact_delay).
+    Onto a surface that faces up, the vehicle falls with g s3_z - alpha through the whole tube. With a small alpha, its normal
+    speed at the start of the tube would be reversed: it would rise from below the surface. Unless the request sets alpha, half
+    of v_min is therefore kept there: alpha >= g s3_z - v_min / (2 (t_k + contact_delay)).
 
     Raises:
         ConfigError: an option is out of its range.
@@ -184,7 +185,7 @@ def perch_settings(request: PerchPlanRequest, settings: PerchSettings, surface: 
 
 
 def perch_plan(found: planner.PerchPlan, request: PerchPlanRequest, contact_time: float) -> PerchPlan:
-    """The answer that carries a plan; `contact_time`: how long a contact is awaited after it [s], 0: it ends in a hover."""
+    """Return the response with a plan; contact_time: time-out for the contact after its end [s], 0: it ends in a hover."""
     trajectory = FlatTrajectory(found.trajectory.durations, found.trajectory.coefficients, seconds(request.start))
     return PerchPlan(
         success=True, message=f"{'contact' if contact_time else 'hovering'} after {found.duration:.3f} s", trajectory=trajectory, contact_time=contact_time,
@@ -192,11 +193,11 @@ def perch_plan(found: planner.PerchPlan, request: PerchPlanRequest, contact_time
 
 
 def refused(error: Exception, limit: float) -> PerchPlan:
-    """The answer where there is no plan.
+    """Return the response without a plan.
 
     Args:
-        error: a `PerchRefusal`, what a job ends with, or what is wrong with the request.
-        limit: wall-clock limit that the plan had [s].
+        error: a `PerchRefusal`, the exception that ended the job, or the error of an invalid request.
+        limit: wall-clock limit of the plan [s].
     """
     if isinstance(error, PerchRefusal):
         return PerchPlan(success=False, error_code=PerchPlanError[error.code.upper()], message=str(error),

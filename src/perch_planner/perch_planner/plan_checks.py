@@ -31,7 +31,7 @@ _FINE = 1e-10      # where a limit falls inside the enclosure
 
 @compiled
 def specific_force(coefficients: Array, duration: float) -> Array:
-    """f = a + g e3 of a segment, the thrust per mass: shape (3, 15) -> Bernstein coefficients of degree 12, (3, 13) [m/s^2]. [defines M:eq9]"""
+    """Specific force f = a + g e3 of a segment: (3, 15) -> Bernstein coefficients (3, 13), degree 12 [m/s^2]. [defines M:eq9]"""
     force = time_derivative(coefficients, 2, duration)
     for k in range(force.shape[1]):
         force[2, k] += GRAVITY
@@ -40,9 +40,9 @@ def specific_force(coefficients: Array, duration: float) -> Array:
 
 @compiled
 def _enclose(coefficients: Array, limit: float, attained_elsewhere: float) -> tuple[float, float, float]:
-    """Attained maximum, proved maximum and place, as far as they exceed the limit or what another segment attains.
+    """Attained maximum, proved maximum and place, enclosed above the lower of the limit and the maximum attained elsewhere.
 
-    Finer where the limit lies between the two.
+    The enclosure is refined where the limit lies between attained and proved maximum.
     """
     scale, floor = magnitude(coefficients), min(attained_elsewhere, limit)
     attained, proved, place = maximum(coefficients, _RELATIVE * scale, floor)
@@ -55,8 +55,8 @@ def _enclose(coefficients: Array, limit: float, attained_elsewhere: float) -> tu
 def thrust_extrema(coefficients: Array, durations: Array, low: float, high: float) -> tuple[Array, float, float]:
     """Least and greatest specific thrust of each segment. [M:eq9] [defines M:eq16]
 
-    A segment's extrema are enclosed closely where they break a limit or are those of the whole plan; other segments have
-    bounds that are proved, but looser.
+    A segment's extrema are enclosed closely where they violate a limit or are those of the whole plan; the bounds of other
+    segments are proved, but looser.
 
     Args:
         coefficients: shape (f, 3, 15) [m].
@@ -125,7 +125,7 @@ def _sample(distance: Array, force: Array, jerk: Array, yaw: Array, yaw_rate: Ar
 
 @compiled
 def _widen(out: Array, attained: Array, row: int, column: int, value: float, proved: float, time: float) -> None:
-    """Take up a segment's attained and proved extremum; column MINIMUM or MAXIMUM."""
+    """Update the results with the attained and proved extremum of a segment; column MINIMUM or MAXIMUM."""
     sign = 1.0 if column == MAXIMUM else -1.0
     if sign * proved > sign * out[row, column]:
         out[row, column] = proved
@@ -135,7 +135,7 @@ def _widen(out: Array, attained: Array, row: int, column: int, value: float, pro
 
 @compiled
 def _within(vector: Array, limit: float) -> bool:
-    """Whether a polynomial vector is shorter than a limit because its Bernstein coefficients are."""
+    """Whether the Bernstein coefficients of a polynomial vector, and so all its values, are within a limit."""
     for k in range(vector.shape[1]):
         if vector[0, k] ** 2 + vector[1, k] ** 2 + vector[2, k] ** 2 > limit * limit:
             return False
@@ -144,7 +144,7 @@ def _within(vector: Array, limit: float) -> bool:
 
 @compiled
 def _doubt(where: Array, row: int, segment: int, place: float) -> None:
-    """Note the first place at which a quantity fails."""
+    """Record the first place at which a limit is in doubt."""
     if where[row, 0] < 0.0:
         where[row, 0], where[row, 1] = segment, place
 
@@ -159,7 +159,7 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
         yaw: of the heading, shape (f, 15) [rad].
         durations: shape (f,) [s].
-        thrust: of `thrust_extrema`.
+        thrust: extrema from `thrust_extrema`.
         p_S, v_S, s3: point of the surface at time 0 [m], its velocity [m/s], outward normal, each shape (3,).
         low_thrust, high_thrust: limits of the specific thrust [m/s^2].
         speed: limit [m/s].

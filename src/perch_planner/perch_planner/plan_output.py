@@ -1,4 +1,4 @@
-"""A perching plan for people and programs: CSV samples, JSON with coefficients and certificates, a picture, what the verifier asks of it."""
+"""Outputs of a perching plan: CSV samples, JSON with coefficients and certificates, a picture, requirements for the verifier."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def states(plan: PerchPlan, mass: float) -> tuple[np.ndarray, list[FlatState]]:
 
 
 def write_csv(path: Path, plan: PerchPlan, mass: float) -> None:
-    """Samples every 2 ms: time [s], position, velocity, acceleration in W, attitude xyzw, rates in B [rad/s], thrust [N]."""
+    """Write 2 ms samples: time [s], position, velocity, acceleration in W, yaw, attitude xyzw, rates in B [rad/s], thrust [N]."""
     from perch_core.so3 import quat_from_matrix
 
     times, full = states(plan, mass)
@@ -44,7 +44,7 @@ def write_csv(path: Path, plan: PerchPlan, mass: float) -> None:
 
 
 def as_json(plan: PerchPlan) -> dict[str, Any]:
-    """Segments in Bernstein form, certificates, and what the planning took."""
+    """Return segments in Bernstein form, certificates, and the number of programs and time of the planning."""
     fields = ("lower_limit", "upper_limit", "minimum", "maximum", "time_of_minimum", "time_of_maximum")
     return {
         "duration": plan.duration, "iterations": plan.iterations, "solve_time": plan.solve_time,
@@ -56,7 +56,7 @@ def as_json(plan: PerchPlan) -> dict[str, Any]:
 
 
 def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Requirements:
-    """What was asked, in the plain numbers of the verifier."""
+    """Return the requirements on a plan as plain numbers for the verifier."""
     limits, start, surface = Limits.of(settings, vehicle), problem.start, problem.surface
     each = Rotors(np.array(vehicle.inertia), vehicle.allocation, limits.rotor_thrust)
     return Requirements(
@@ -72,7 +72,7 @@ def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
 
 
 def draw(path: Path, plan: PerchPlan, problem: PerchProblem, limits: Limits, vehicle: Vehicle) -> None:
-    """Picture: the way in the vertical plane of the approach with the thrust, and thrust, speed, body rate over time."""
+    """Draw the path in the vertical plane of the approach with thrust arrows, and thrust, velocity and body rate over time."""
     from matplotlib.figure import Figure
 
     times, full = states(plan, vehicle.mass)

@@ -2,7 +2,7 @@
 
 For given durations a QP is solved and its plan checked; where a limit is violated, linear bounds are added and the QP is
 solved again; where that does not help, the durations grow [M:IV-C.3] and the approach is divided more finely. Each loop is
-bounded: a search ends after `search.ITERATIONS_MAX` programs. The procedure as the paper has it: `paper.paper_m`.
+bounded: a search ends after `search.ITERATIONS_MAX` programs. `paper.paper_m` is the procedure as printed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class PerchPlan:
         certificates: one for each limit.
         iterations: QPs solved.
         solve_time: wall-clock time [s].
-        attempts: what was tried on the way, in order.
+        attempts: quadratic programs of the search, in order.
     """
 
     trajectory: FlatTrajectory
@@ -57,7 +57,7 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
         A plan that keeps every limit, each with its proof.
 
     Raises:
-        PerchRefusal: there is none, or none was found; with the violated constraint and its margin.
+        PerchRefusal: no plan exists or was found; carries the violated constraint and its margin.
     """
     begin = perf_counter()
     limits = Limits.of(settings, vehicle)

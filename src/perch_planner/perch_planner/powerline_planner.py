@@ -1,4 +1,4 @@
-"""The powerline planner as a component: service `plan_powerline`, requests to plans or typed refusals. [P:V]"""
+"""Powerline planner component: answers requests of `plan_powerline` with plans or typed refusals. [P:V]"""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class PowerlinePlannerParameters(PowerlineSettings):
 
 @dataclass(frozen=True)
 class Task:
-    """What a job is about.
+    """Input of a planning job.
 
     Attributes:
         vehicle: name or file.
         settings: of the planner.
-        request: what to plan.
+        request: request of the planner.
         start: as in `service.answer`.
     """
 
@@ -50,8 +50,8 @@ class Task:
 class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
     """Plans perches on lines; each plan is a job that the host may run in another process.
 
-    A deadline counts from the request on, other requests being solved first. A first solver that was stopped at 60 % of it
-    leaves the rest to ipopt.
+    A deadline counts from the request and includes the wait for earlier requests. Where the first solver is stopped at 60 % of
+    it, ipopt gets the rest.
     """
 
     config_type = PowerlinePlannerParameters
@@ -69,11 +69,11 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
         self._settings.check(self._vehicle)
 
     def preload(self) -> Callable[[], Any]:
-        """Load the planner, and compile it the first time on a machine."""
+        """Return the function that loads the planner, and compiles it the first time on a machine."""
         return partial(planner_of, self.config.vehicle, self._settings)
 
     def on_plan_powerline(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None]) -> None:
-        """Plan, and reply when there is an answer."""
+        """Plan a perch or recovery, and reply with the plan or a refusal."""
         try:
             service.check_request(request)
             deadline = min(float(request.deadline or self.config.deadline), DEADLINE_MAX)
@@ -85,7 +85,7 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
         self._ask(request, reply, task)
 
     def _ask(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], task: Task) -> None:
-        """Have a task solved within a share of its deadline; what is left is for ipopt."""
+        """Start the job of a task with a share of its deadline; ipopt gets the rest where that job is stopped."""
         deadline = task.request.deadline
         rest = (1.0 - FIRST_SHARE) * deadline
 
@@ -108,7 +108,7 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
         self._reply(request, reply, found)
 
     def _reply(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], found: Any) -> None:
-        """Reply with a plan, or with the error that there is in its place."""
+        """Reply with a plan, or with the error that occurred instead."""
         if isinstance(found, PowerlinePlan):
             answer = found
         else:
@@ -122,17 +122,17 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
 
 @lru_cache(maxsize=2)
 def planner_of(vehicle: str, settings: PowerlineSettings) -> PowerlinePlanner:
-    """The planner with everything that its first plan would load; kept for the next plan of this process."""
+    """Return a planner with everything loaded that its first plan needs; cached for the next plans of this process."""
     planner = PowerlinePlanner(load_vehicle(vehicle), settings)
     planner.warm_up()
     return planner
 
 
 def solve(task: Task) -> PowerlinePlan:
-    """Plan; the job of a request.
+    """Plan, as the job of a request.
 
     Raises:
-        PlanningRefusal: there is no plan; code solver where the numerics failed in a way that nobody had foreseen.
+        PlanningRefusal: no plan was found; code `solver` after an unexpected error.
     """
     planner = planner_of(task.vehicle, task.settings)
     try:

@@ -1,4 +1,4 @@
-"""What a perching plan is asked for: start, surface, waypoints, and the settings and limits that hold on the way."""
+"""Definition of a perching problem: start, surface, waypoints, settings and limits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ZERO: Any = (0.0, 0.0, 0.0)  # made an array, as what is given
 
 
 def _vector(source: str, key: str, value: Any) -> np.ndarray:
-    """A finite vector of three.
+    """Convert a value to a finite vector, shape (3,).
 
     Raises:
         ConfigError: wrong size, or a value that is not finite.
@@ -63,7 +63,7 @@ class StartState:
 
     @classmethod
     def on(cls, trajectory: FlatTrajectory, t: float) -> StartState:
-        """The state of a running trajectory at a time [s since its start], to replace its rest.
+        """Return the state of a running trajectory at a time [s since its start], where a new plan replaces the rest.
 
         Raises:
             ConfigError: the time is outside the trajectory.
@@ -77,7 +77,7 @@ class StartState:
 
 @dataclass(frozen=True)
 class Waypoint:
-    """A place to pass, with derivatives where they matter. [M:eq6]
+    """Position to pass, with optional derivatives. [M:eq6]
 
     Attributes:
         p: position in W [m], shape (3,).
@@ -103,7 +103,7 @@ class PerchProblem:
     Attributes:
         start: flat outputs at time 0.
         surface: the surface at time 0; the vehicle ends at perch_offset in front of its centre, with b3 = s3.
-        waypoints: places to pass, in order; in W, also with a moving target.
+        waypoints: positions to pass, in order; in W, also for a moving target.
         target_velocity: constant velocity of the surface in W [m/s], shape (3,).
         segment_times: first guess of the segment durations [s], one more than waypoints; None: chosen by the planner.
     """
@@ -163,9 +163,9 @@ class PerchParameters:
 
 @dataclass(frozen=True)
 class PerchSettings(PerchParameters):
-    """Parameters of the planner with what one plan may choose: a request, a problem file, a trial with relaxed limits.
+    """Parameters of the planner, and the options of a single plan: of a request, a problem file or a trial with relaxed limits.
 
-    Where 0 stands for "the vehicle's", the limit comes from the vehicle file.
+    Where the description of an option names the vehicle, 0 stands for the limit of the vehicle file.
     """
 
     thrust_max: float = quantity(0.0, unit="N", low=0.0, doc="tau_max of [M:eq16]; 0: thrust_reserve x the vehicle's")
@@ -199,7 +199,7 @@ class Limits(NamedTuple):
 
     @classmethod
     def of(cls, settings: PerchSettings, vehicle: Vehicle) -> Limits:
-        """The limits of a vehicle, where the settings do not replace them."""
+        """Return the limits of the settings, with those of the vehicle where the settings leave them open."""
         least, most = vehicle.thrust_min, vehicle.thrust_max
         free = settings.rotor_margin * (most - least)
         return cls(
@@ -216,7 +216,7 @@ class Limits(NamedTuple):
 def contact_heading(surface: PerchSurface) -> float:
     """Yaw at contact with b2_des parallel to s2 [rad]. [M:eq12]
 
-    On a pad that is turned so far that s2 points up or down, the heading of the approach, -s3, counts instead.
+    Where s2 lies within 30 degrees of the vertical, the heading of the approach, -s3, is used instead.
     """
     s2, s3 = surface.R_WS[:, 1], surface.normal
     if hypot(s2[0], s2[1]) > 0.5:

@@ -21,7 +21,7 @@ _ZERO = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class StartSection:
-    """Where the plan begins."""
+    """State at the start of the plan."""
 
     position: Vector3 = quantity(unit="m")
     velocity: Vector3 = quantity(_ZERO, unit="m/s")
@@ -33,7 +33,7 @@ class StartSection:
 
 @dataclass(frozen=True, kw_only=True)
 class TargetSection:
-    """The surface."""
+    """Pose and velocity of the surface."""
 
     position: Vector3 = quantity(unit="m", doc="centre of the pad")
     inclination_deg: float = quantity(unit="deg", low=0.0, high=180.0, doc="0 a table, 90 a wall, 180 a ceiling")
@@ -43,7 +43,7 @@ class TargetSection:
 
 @dataclass(frozen=True, kw_only=True)
 class WaypointSection:
-    """A place to pass."""
+    """Position to pass, with optional derivatives."""
 
     position: Vector3 = quantity(unit="m")
     velocity: Vector3 | None = quantity(None, unit="m/s")
@@ -65,10 +65,10 @@ class PerchFile:
 
 
 def read_problem(mapping: Any, source: str) -> tuple[PerchProblem, PerchSettings, Vehicle]:
-    """Problem, settings and vehicle of a parsed file.
+    """Return problem, settings and vehicle of a parsed file.
 
     Args:
-        mapping: what the YAML holds.
+        mapping: content of the YAML file.
         source: file name, for messages.
 
     Raises:

@@ -77,9 +77,9 @@ def functional(duration: float, unit: float, s: float, order: int) -> Array:
 
 @compiled
 def _roles(given: Flags, first: Indices) -> tuple[Indices, Indices]:
-    """For each unknown: 0 given, 1 free, 2 dependent; and the dependent unknown of each inner knot.
+    """Role of each unknown (0 given, 1 free, 2 dependent), and the dependent unknown of each inner knot.
 
-    Dependent is the knot's highest derivative that is free, or else a bubble beside it.
+    The dependent unknown is the highest free derivative of the knot, or else the first bubble of the segment after it.
     """
     f = len(given) - 1
     role = np.ones(4 * (f + 1) + BUBBLES * (first >= 0).sum(), np.int64)
@@ -100,7 +100,7 @@ def _roles(given: Flags, first: Indices) -> tuple[Indices, Indices]:
 
 @compiled
 def _eliminate(durations: Array, unit: float, first: Indices, role: Indices, dependent: Indices, particular: Array) -> Array:
-    """All unknowns from the free ones, shape (n, m), with a continuous fourth derivative; completes `particular`. [defines M:eq7]"""
+    """Map from free to all unknowns, shape (n, m), with continuous fourth derivative; completes `particular`. [defines M:eq7]"""
     f, n = len(durations), len(role)
     column = np.full(n, -1)
     m = 0
@@ -165,7 +165,7 @@ def _weigh(durations: Array, unit: float, first: Indices, role: Indices, basis: 
 
 @compiled
 def _reduced_cost(weighted: Array, basis: Array, role: Indices) -> Array:
-    """Cost Z' C Z of the free unknowns themselves, and of those that depend on them, shape (m, m). [defines M:eq4]"""
+    """Cost Z' C Z of the free unknowns, including those that depend on them, shape (m, m). [defines M:eq4]"""
     m = basis.shape[1]
     out = np.empty((m, m))
     i = 0
@@ -191,14 +191,14 @@ def assemble(durations: Array, given: Flags, values: Array, bubbles: Flags, gram
         given: which of position, velocity, acceleration, jerk are given at each knot, bool, shape (f + 1, 4).
         values: their values in W [m, m/s, ...], shape (f + 1, 4, 3); ignored where not given.
         bubbles: which segments have bubbles, bool, shape (f,). A segment that starts at a knot with everything given
-            must have them: a bubble then serves the continuity of the fourth derivative.
+            must have them: a bubble then ensures the continuity of the fourth derivative.
         gram, cost_order: of `reference_element.GRAMS`, 4 minimises snap, 3 jerk.
 
     Returns:
         The program, as described at `ProgramArrays`.
 
     Raises:
-        numpy.linalg.LinAlgError: the cost is not positive definite on what is left free.
+        numpy.linalg.LinAlgError: the cost is not positive definite in the free unknowns.
     """
     f = len(durations)
     unit = durations.sum() / f
@@ -240,7 +240,7 @@ def assemble(durations: Array, given: Flags, values: Array, bubbles: Flags, gram
 
 @compiled
 def coefficients(program: ProgramArrays, w: Array) -> Array:
-    """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]; program: of `assemble`."""
+    """Bernstein coefficients of x, y, z of a solution `w`, shape (f, 3, 15) [m]; program: from `assemble`."""
     durations, first, unit, spread, centre = program
     m, n = spread.shape
     unknowns = np.empty((3, n))

@@ -1,7 +1,7 @@
 """Linear bounds as rows of the reduced program. [M:eq8 in whitened coordinates]
 
-A functional phi of one segment, taken along a direction d, is the row d (x) (L^-1 Z' phi) of w, and its value at the
-unconstrained optimum moves to the bounds. Rows have unit length: solvers otherwise called violated ones solved.
+A functional phi of one segment, taken along a direction d, is the row d (x) (L^-1 Z' phi) of w; its value at the
+unconstrained optimum is subtracted from the bounds. Rows have unit length: otherwise solvers can report violated rows as solved.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Rows = tuple[Array, Array, Array]
 
 @compiled
 def _place(local: Array, segment: int, first: int, wide: Array, centre: Array, column: Array, constant: Array) -> None:
-    """A functional of one segment in whitened coordinates: `column` of w, and its value at the optimum; wide: `spread` transposed."""
+    """Whiten a functional of a segment: factors of w to `column`, optimum value to `constant`; wide: `spread` transposed."""
     count = FUNCTIONS if first >= 0 else HERMITE
     for d in range(3):
         constant[d] = 0.0
@@ -36,7 +36,7 @@ def _place(local: Array, segment: int, first: int, wide: Array, centre: Array, c
 
 @compiled
 def whitened(program: ProgramArrays, segment: int) -> Array:
-    """Factors of a segment's functions from w of one dimension, and from the constants of all three, shape (15, size + 3)."""
+    """Coefficients of a segment's functions: factors of w of one dimension, then constants of all three, shape (15, size + 3)."""
     durations, first, unit, spread, centre = program
     m, scale = len(spread), scales(durations[segment] / unit)
     out = np.zeros((FUNCTIONS, m + 3))
@@ -62,7 +62,7 @@ def normalise(rows: Array, lower: Array, upper: Array) -> None:
 
 @compiled
 def rows_of(program: ProgramArrays, bounds: BoundArrays) -> Rows:
-    """Rows of bounds: rows (r, 3 size) of unit length, lower (r,), upper (r,); program: of `reduced_qp.assemble`, bounds: fields of `Bounds`."""
+    """Convert fields of `Bounds` into unit rows (r, 3 size) and bounds (r,), (r,) of a program of `reduced_qp.assemble`."""
     durations, first, unit, spread, centre = program
     owner, segments, places, orders, direction, lower, upper = bounds
     m, wide = len(spread), spread.T.copy()
@@ -84,5 +84,5 @@ def rows_of(program: ProgramArrays, bounds: BoundArrays) -> Rows:
 
 @compiled
 def stacked(above: Rows, below: Rows) -> Rows:
-    """Rows of one program, one set below the other."""
+    """Stack two sets of rows of one program."""
     return (np.concatenate((above[0], below[0])), np.concatenate((above[1], below[1])), np.concatenate((above[2], below[2])))

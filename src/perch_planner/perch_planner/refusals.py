@@ -1,4 +1,4 @@
-"""Why there is no plan: typed, with the violated constraint and its margin."""
+"""Typed refusals of perching plans, with the violated constraint and its margin."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ SOLVER = "solver"
 
 
 class PerchRefusal(PlanningRefusal):
-    """A refusal with the certificates of the last plan that was checked on the way.
+    """Raised when there is no plan; carries the certificates of the last plan that was checked.
 
     Attributes:
-        certificates: empty where no plan was found at all.
+        certificates: empty where no plan was checked.
         iterations: QPs solved.
-        relaxed: values of settings with which there is a plan, or another obstacle; empty where none are known.
+        relaxed: values of settings that admit a plan; empty where none are known.
     """
 
     def __init__(self, code: str, constraint: str, margin: float, message: str, certificates: tuple[Certificate, ...] = (),
@@ -42,20 +42,20 @@ class PerchRefusal(PlanningRefusal):
 @compiled
 def _figures(points: Array, a: Array, j: Array, yaw: float, yaw_rate: float, R_WS: Array, extension: float, offset: float, moving: bool,
              low_height: float, high_height: float, clearance: float) -> tuple[float, float, float, float, int, float, int, float, float]:
-    """What is known of a plan from its start and its points.
+    """Quantities of a plan that its start and its points determine.
 
     Args:
         points: start, waypoints and the surface's centre in W [m], shape (k, 3).
         a, j, yaw, yaw_rate: of the start [m/s^2, m/s^3, rad, rad/s].
         R_WS: axes of the surface, the last its outward normal.
         extension, offset: radius of the vehicle's disc, and distance of its centre from the surface at contact [m].
-        moving: the contact's place is not known.
+        moving: the height of the contact is unknown, as the target moves vertically.
         low_height, high_height, clearance: limits [m].
 
     Returns:
-        (specific thrust of the start [m/s^2], its body rate [rad/s], reach of the rim towards the surface at the start [m], distance of the start
-        from the surface's plane [m], first point whose height is out of range and that height [m], first waypoint that is too
-        near to the plane and its distance [m], least length of the way to the contact [m]); points are -1 where there is none.
+        (specific thrust of the start [m/s^2], its body rate [rad/s], reach of the rim towards the surface at the start [m],
+        distance of the start from the surface's plane [m], first point whose height is out of range and that height [m], first
+        waypoint too near to the plane and its distance [m], least path length to the contact [m]); points are -1 for none.
     """
     x, y, z = a[0], a[1], a[2] + GRAVITY
     specific, rate = sqrt(x * x + y * y + z * z), sqrt(squared_rate(x, y, z, j[0], j[1], j[2], yaw, yaw_rate))
@@ -80,11 +80,12 @@ def _figures(points: Array, a: Array, j: Array, yaw: float, yaw_rate: float, R_W
 
 
 def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle) -> None:
-    """Refuse what no trajectory can do, before a QP is solved.
+    """Refuse problems that no trajectory can solve, before a QP is solved.
 
     Raises:
-        PerchRefusal: the surface's attitude needs a thrust out of range [M:eq9, M:eq11], the vehicle cannot hover, the
-            start or the contact break the box, the start breaks the thrust range or turns too fast, or the contact is too far away.
+        PerchRefusal: the thrust limits are empty, the surface's attitude needs a thrust out of range [M:eq9, M:eq11], the
+            vehicle cannot hover, start, waypoint or contact violate the box, the start violates thrust range or body rate,
+            or the contact is too far away.
     """
     low, high = limits.thrust
     contact = vehicle.mass * settings.impact_acceleration

@@ -1,10 +1,9 @@
-"""What stands in the way of a plan: a small set of limits whose relaxation gives one, and how little of it.
+"""Diagnosis of a failed search: a small set of limits whose relaxation admits a plan, and by how much to relax them.
 
-Only limits that acted on the search can be the cause: without one that did not, it would go the same way. Those that alone may
-do are taken away one at a time: what a caller can change first, then the range of the single rotors, which binds before other
-limits of the vehicle. Where none is enough, all are taken away, and put back one by one where there is a plan with them (the
-deletion filter of Chinneck and Dravnieks, 1991). Bisection looks for how little is enough. With every value that is named there was a
-plan.
+Only limits that acted on the search can be the cause: the search is the same without any other. Limits whose removal alone may
+suffice are removed one at a time: first those that a caller can change, then the range of the single rotors, which binds before
+other limits of the vehicle. Where no single one suffices, all are removed, and restored one by one where a plan keeps them (the
+deletion filter of Chinneck and Dravnieks, 1991). Bisection reduces the relaxation. The reported values are kept by a plan.
 """
 
 from __future__ import annotations
@@ -25,19 +24,19 @@ from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Outcome, Search
 
 PROGRAMS = 170
-"""Quadratic programs of all searches with relaxed limits."""
+"""Greatest number of quadratic programs in all searches with relaxed limits."""
 _EACH = 30       # of one of them
 _TRIALS = 3      # of values: what the plan took of a limit, then halves of the logarithm
 _LEAST = 1 / 64  # of what a plan takes beyond a limit that was taken away; less is not tried
 
 
 class _Limit(NamedTuple):
-    """A limit by the name of its setting.
+    """A limit that a trial can relax.
 
     Attributes:
-        free: value that takes it away.
-        code: of a refusal because of it.
-        words, unit: for the message.
+        free: value of the setting that removes the limit.
+        code: refusal code where this limit is the cause.
+        words, unit: its name and unit in messages.
     """
 
     free: float
@@ -62,14 +61,14 @@ _ALONE = ("height_min", "height_max", "duration_max", "speed_max", "rotor_margin
 
 
 def refusal(search: Search, best: Outcome) -> PerchRefusal:
-    """Why a search found no plan.
+    """Return a refusal that explains why a search found no plan.
 
     Args:
-        search: after its end.
-        best: its last outcome.
+        search: the finished search.
+        best: the outcome that `Search.run` returned.
 
     Returns:
-        A refusal whose `relaxed` are values of settings with which there is a plan; empty: none was found even without limits.
+        A refusal whose `relaxed` holds settings that admit a plan; it is empty where none was found even without limits.
     """
     settings, vehicle = search.settings, search.vehicle
     asked = _asked(settings, Limits.of(settings, vehicle))
@@ -94,13 +93,13 @@ def refusal(search: Search, best: Outcome) -> PerchRefusal:
 
 
 def _asked(settings: PerchSettings, limits: Limits) -> dict[str, float]:
-    """The limits that hold, by the names of their settings."""
+    """Return the limits in force by the names of their settings."""
     return {name: getattr(settings, name) for name in _LIMITS} | {
         "thrust_min": limits.thrust[0], "thrust_max": limits.thrust[1], "body_rate_max": limits.body_rate}
 
 
 def _said(name: str, value: float, least: float, most: float) -> str:
-    """A value in words; least, most: thrust of a rotor [N]."""
+    """Return a value as text; least, most: thrust range of a rotor [N]."""
     beyond = ""
     if name == "thrust_max" and value > 4.0 * most:
         beyond = f" (the vehicle has {4.0 * most:.3g} N)"
@@ -112,19 +111,19 @@ def _said(name: str, value: float, least: float, most: float) -> str:
 
 
 def _free(names: Iterable[str]) -> dict[str, float]:
-    """Values that take limits away."""
+    """Return the values that remove limits."""
     return {name: _LIMITS[name].free for name in names}
 
 
 class _Trials:
-    """Searches with relaxed limits, with a bound on their programs."""
+    """Searches with relaxed limits, bounded by their total number of programs."""
 
     def __init__(self, search: Search, asked: dict[str, float]) -> None:
         self._search, self._asked, self._left = search, asked, PROGRAMS
         self._tried: dict[frozenset[str], dict[str, float] | None] = {}
 
     def _used(self, changes: dict[str, Any]) -> dict[str, float] | None:
-        """What the plan under changed settings takes of each limit, None where none is soon found."""
+        """Return what a plan under changed settings uses of each limit; None where a short search finds no plan."""
         if not changes or self._left <= 0:
             return None
         settings = replace(self._search.settings, minimum_time=False, **changes)
@@ -134,14 +133,14 @@ class _Trials:
         return _used(trial.problem, outcome, trial.vehicle) if outcome.proved else None
 
     def _without(self, names: Iterable[str]) -> dict[str, float] | None:
-        """What the plan without some limits takes of each, None where none is soon found."""
+        """Return what a plan without some limits uses of each limit; None where a short search finds no plan."""
         taken = frozenset(names)
         if taken not in self._tried:
             self._tried[taken] = self._used(_free(names))
         return self._tried[taken]
 
     def _smallest(self) -> tuple[list[str], dict[str, float]] | None:
-        """Limits without which there is a plan, none of which can stay, and what it takes; None: no plan without any limit."""
+        """Return a small set of limits whose removal admits a plan, and the use of that plan; None: no plan without limits."""
         taken = [name for name in _LIMITS if name != "thrust_min"]  # where the thrust may vanish, proofs fail
         used = self._without(taken)  # first, as it takes few programs: what is named where they are used up before fewer limits are tried
         for name in _ALONE:
@@ -161,11 +160,11 @@ class _Trials:
         return self._beyond(taken, used) or taken, used
 
     def _beyond(self, names: Iterable[str], used: dict[str, float]) -> list[str]:
-        """Limits that a plan does not keep as they were asked for."""
+        """Return the limits whose requested values a plan violates."""
         return [n for n in names if (used[n] - self._asked[n]) * (_LIMITS[n].free - self._asked[n]) > 0.0]
 
     def way(self) -> dict[str, float] | None:
-        """Values of some limits with which there is a plan, as near to what was asked as bisection finds them; None: none."""
+        """Return values of limits that admit a plan, as near to the requested ones as bisection finds; None: none exist."""
         if (smallest := self._smallest()) is None:
             return None
         names, used = smallest
@@ -180,7 +179,7 @@ class _Trials:
         return values
 
     def _shares(self, names: Iterable[str], used: dict[str, float], share: float) -> dict[str, float]:
-        """Values of limits: a share of what the plan took beyond them, 1 for all of it."""
+        """Return limits relaxed by a share of the excess of a plan over them; 1 covers all of it."""
         values = {}
         for name in names:
             asked, free = self._asked[name], _LIMITS[name].free
@@ -189,7 +188,7 @@ class _Trials:
 
 
 def _outward(asked: float, value: float) -> float:
-    """A value with two digits of its difference from what was asked, rounded away from that."""
+    """Round a value to two digits of its difference from the requested one, away from the requested one."""
     if value == asked:
         return value
     unit = 10.0 ** (floor(log10(abs(value - asked))) - 1)
@@ -197,7 +196,7 @@ def _outward(asked: float, value: float) -> float:
 
 
 def _used(problem: PerchProblem, outcome: Outcome, vehicle: Vehicle) -> dict[str, float]:
-    """What a plan takes of each limit, by the names of their settings."""
+    """Return what a plan uses of each limit, by the names of their settings."""
     rows = dict(zip(plan_checks.NAMES, outcome.results))
     last, T = outcome.coefficients[-1], outcome.durations[-1]
     v = (last.shape[1] - 1) * (last[:, -1] - last[:, -2]) / T - problem.target_velocity

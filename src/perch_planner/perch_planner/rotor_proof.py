@@ -1,10 +1,10 @@
-"""A proof that single rotors keep their range on a whole plan. [uses M:eq1, M:eq10, M:eq12, M:eq13, P:eq2]
+"""Proof that single rotors keep their range on a whole plan. [uses M:eq1, M:eq10, M:eq12, M:eq13, P:eq2]
 
-The rotor thrusts that `rotor_thrusts` samples are no polynomials, but they are made of some: specific force, jerk and snap, yaw and
-two derivatives. Around the middle of an interval each of these is a Taylor model of second order: its expansion in powers ends, and
-the absolute values of the terms beyond the second derivative bound what that changes by. The same formulas in such numbers
-(`taylor_models`) bound each rotor's thrust. Intervals are looked at eight at a time. Where their bounds leave the limits, or are not
-near to what is attained, they are halved.
+The rotor thrusts that `rotor_thrusts` samples are not polynomials, but functions of polynomials: specific force, jerk and snap,
+yaw and two derivatives. Around the middle of an interval each of these is a Taylor model of second order: its power expansion is
+finite, and the absolute values of the higher terms bound the change of the second derivative. The same formulas in this
+arithmetic (`taylor_models`) bound the thrust of each rotor. Eight intervals are evaluated at a time. They are halved where their
+bounds exceed the limits, or are not close to attained values.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _SMALLEST = 1e-6  # squared lengths that may be less have no direction
 _MIDDLES = (np.arange(_LANES) + 0.5) / _LANES
 _EXPANSION = np.hstack([comb(14, k) * (0.5 / _LANES) ** k * np.diff(np.eye(_POWERS), k) @ bernstein.basis(14 - k, _MIDDLES).T
                         for k in range(_POWERS)])
-"""From Bernstein coefficients to coefficients of the powers of t in [-1, 1] around the middle of each lane: by power, then by lane."""
+"""Map from Bernstein to power coefficients, in t in [-1, 1] around the middle of each lane, by power, then by lane."""
 
 _ELEVATED = [perm(14, n) * bernstein.elevate(np.diff(np.eye(_POWERS), n), 14) for n in range(5)]
 _DERIVATIVES = np.hstack(_ELEVATED[2:]), np.hstack(_ELEVATED[:3])
-"""As `rotor_thrusts.bases_at`, but to Bernstein coefficients of degree 14 instead of values."""
+"""Maps like those of `rotor_thrusts.bases_at`, but to Bernstein coefficients of degree 14 instead of values."""
 
 # Places in the work array: 12 models of the inputs, sine and cosine of the yaw, 4 models of the wrench, 4 rows of bounds.
 _TURN, _WRENCH, _BOUNDS = 48 * _LANES, 64 * _LANES, 80 * _LANES
@@ -45,11 +45,11 @@ _FIRST = 16
 
 @compiled
 def _numbers(rows: Array, powers: Array, work: Array) -> None:
-    """Models in each lane.
+    """Compute the Taylor models of all inputs in each lane.
 
     Args:
         rows: Bernstein coefficients, shape (12, 15).
-        powers: receives coefficients of the powers, shape (12, 15 lanes).
+        powers: receives the power coefficients, shape (12, 15 lanes).
         work: receives the models, each with its 4 numbers for all lanes.
     """
     np.dot(rows, _EXPANSION, powers)
@@ -78,7 +78,7 @@ def _vector(work: Array, n: int, lane: int) -> Vector:
 
 @compiled(inline=True)
 def _direction(f: Vector, df: Vector, ddf: Vector, k: Taylor) -> tuple[Vector, Vector, Vector]:
-    """As `flatness.direction_derivatives`, with k = 1 / |f|."""
+    """Taylor models of `flatness.direction_derivatives`, with k = 1 / |f|."""
     u = scale(k, f)
     dn = dot(u, df)
     du = scale(k, axpy(times(-1.0, dn), u, df))
@@ -88,7 +88,7 @@ def _direction(f: Vector, df: Vector, ddf: Vector, k: Taylor) -> tuple[Vector, V
 
 @compiled(inline=True)
 def _heading(yaw: Taylor, rate: Taylor, acceleration: Taylor, sin_yaw: float, cos_yaw: float) -> tuple[Vector, Vector, Vector]:
-    """As `flatness.heading_derivatives`."""
+    """Taylor models of `flatness.heading_derivatives`."""
     s, c, squared = sine(yaw, sin_yaw, cos_yaw), sine(yaw, cos_yaw, -sin_yaw), mul(rate, rate)
     return ((times(-1.0, s), c, ZERO), (times(-1.0, mul(c, rate)), times(-1.0, mul(s, rate)), ZERO),
             (sub(mul(s, squared), mul(c, acceleration)), times(-1.0, add(mul(c, squared), mul(s, acceleration))), ZERO))
@@ -97,7 +97,7 @@ def _heading(yaw: Taylor, rate: Taylor, acceleration: Taylor, sin_yaw: float, co
 @compiled(inline=True)
 def _wrench(f: Vector, df: Vector, ddf: Vector, h: Vector, dh: Vector, ddh: Vector, mass: float, J: Vector3
             ) -> tuple[bool, Taylor, Taylor, Taylor, Taylor]:
-    """Whether thrust and heading cannot vanish, and models of the thrust [N] and of the moments [N m]."""
+    """Return whether thrust and heading provably do not vanish, and models of the thrust [N] and of the moments [N m]."""
     squared = dot(f, f)
     inverse = inverse_root(squared)
     b3, db3, ddb3 = _direction(f, df, ddf, inverse)
@@ -117,11 +117,11 @@ def _wrench(f: Vector, df: Vector, ddf: Vector, h: Vector, dh: Vector, ddh: Vect
 
 @compiled
 def _enclose(work: Array, mass: float, J: Vector3, mixing: Array) -> None:
-    """Bounds of the rotor thrusts in each lane [N].
+    """Compute bounds of the rotor thrusts in each lane [N].
 
     Args:
-        work: models of `_numbers`; from `_BOUNDS` on it receives the least and the greatest that is attained, a lower and an upper bound.
-        mass, J, mixing: of `rotor_thrusts.rotor_model`.
+        work: models from `_numbers`; receives, from `_BOUNDS` on, least and greatest attained thrust, lower and upper bound.
+        mass, J, mixing: from `rotor_thrusts.rotor_model`.
     """
     for lane in range(_LANES):
         yaw = work[36 * _LANES + lane]
@@ -150,16 +150,16 @@ def _enclose(work: Array, mass: float, J: Vector3, mixing: Array) -> None:
 @compiled
 def prove_rotors(coefficients: Array, yaw: Array, durations: Array, lowest: float, highest: float, low: float, high: float, mass: float,
                  J: Vector3, mixing: Array) -> tuple[bool, float, float]:
-    """Prove that each rotor's thrust stays within [low, high], or find where it does not.
+    """Prove that each rotor's thrust stays within [low, high], or find a thrust outside.
 
     Args:
         coefficients, yaw, durations, mass, J, mixing: as for `rotor_thrusts.sampled`.
-        lowest, highest: thrusts that are attained [N].
+        lowest, highest: attained thrusts, from samples [N].
         low, high: limits [N].
 
     Returns:
-        (holds, lowest, highest): proved bounds of all thrusts [N]. Where a thrust beyond the limits was found, or nothing could be
-        proved, `holds` is False, and the others are thrusts that are attained.
+        (holds, lowest, highest): proved bounds of all thrusts [N]. Where a thrust violates the limits or the proof fails, `holds`
+        is False, and the others are attained thrusts.
     """
     tight, proved_low, proved_high = _TIGHT * (high - low), lowest, highest
     powers, work = np.empty((12, _POWERS * _LANES)), np.empty(_BOUNDS + 4 * _LANES)

@@ -1,13 +1,13 @@
-"""Thrusts of the single rotors that a plan asks for: where they leave their range, and linear bounds against it.
+"""Thrusts of the single rotors along a plan, violations of their range, and linear bounds against these.
 
-Collective thrust within its range [M:eq16] does not suffice: turning takes moments, and near contact, where the thrust is
-low, the rotors have little left for them. From the flat outputs, flatness gives thrust, body rates and angular
+A collective thrust within its range [M:eq16] does not suffice: rotation requires moments, and near contact, where the thrust
+is low, the rotors have little reserve for them. From the flat outputs, flatness gives thrust, body rates and angular
 accelerations [M:eq9-13], and with Euler's equation [M:eq1] and the allocation [P:eq2]
 
     f = A^-1 (m |f|, J w' + w x J w).
 
-That is no polynomial, so it is sampled, the extrema refined by parabolas through the samples; `rotor_proof` proves what they promise.
-It is smooth in acceleration, jerk and snap: its linearisation at the present plan bounds the next one.
+This f is not polynomial. It is sampled, and its extrema are refined by parabolas through the samples; `rotor_proof` proves them.
+It is smooth in acceleration, jerk and snap: its linearisation at the present plan bounds the next plan.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ Rotors = tuple[float, float, float, Vector3, Array]
 
 
 def rotor_model(vehicle: Vehicle) -> RotorModel:
-    """What the kernels need of a vehicle."""
+    """Return the parameters of a vehicle for the kernels."""
     return vehicle.mass, vector3(vehicle.inertia), _inverse(tuple(vehicle.allocation.ravel().tolist()))
 
 
 @lru_cache(maxsize=16)
 def _inverse(entries: tuple[float, ...]) -> Array:
-    """Inverse of a matrix of four rows: every plan of a vehicle takes the same."""
+    """Inverse of a 4 x 4 matrix, cached, as all plans of a vehicle use the same."""
     return np.ascontiguousarray(np.linalg.inv(np.reshape(entries, (4, 4))))
 
 
 def bases_at(places: Array) -> tuple[Array, Array]:
-    """From Bernstein coefficients to values at places in [0, 1]: second to fourth, and zeroth to second derivative, shapes (15, 3 places)."""
+    """Maps from Bernstein coefficients to the derivatives 2 to 4 and 0 to 2 at places in [0, 1], shapes (15, 3 places)."""
     rows = [perm(14, n) * np.diff(np.eye(15), n) @ bernstein.basis(14 - n, places).T for n in range(5)]
     return np.hstack(rows[2:]), np.hstack(rows[:3])
 
@@ -69,13 +69,13 @@ _FUNCTIONS_AT = np.vstack([bernstein.basis(DEGREE - n, _PLACES) @ TABLES[n, :DEG
 
 @compiled
 def three_derivatives(coefficients: Array, order: int, duration: float, basis: Array, out: Array) -> None:
-    """Derivatives of three orders from `order` on, by order, then by polynomial.
+    """Compute derivatives of three successive orders from `order` on, by order, then by polynomial.
 
     Args:
         coefficients: Bernstein coefficients, shape (r, 15).
-        order: of the first of them.
+        order: lowest order.
         duration: of the segment [s].
-        basis: of `bases_at`, shape (15, 3 places).
+        basis: from `bases_at`, shape (15, 3 places).
         out: receives the values, shape (3 r, places).
     """
     r, count = len(coefficients), out.shape[1]
@@ -129,9 +129,9 @@ def plan_headings(yaw: Array, durations: Array) -> Array:
 
 @compiled
 def thrusts_along(x: Array, heading: Array, mass: float, J: Vector3, mixing: Array, out: Array) -> None:
-    """Rotor thrusts [N] at each place of `motion` and `headings`, into `out`, shape (4, places); -1000 N in all where no attitude is defined.
+    """Write rotor thrusts [N] at each place of `motion` and `headings` to `out`, shape (4, places).
 
-    The first loop has no branches: compiled, it takes several places at a time.
+    Where no attitude is defined, the collective thrust is -1000 N. The first loop has no branches, so that it is vectorised.
     """
     count = x.shape[1]
     for k in range(count):
@@ -153,9 +153,9 @@ def thrusts_along(x: Array, heading: Array, mass: float, J: Vector3, mixing: Arr
 
 @compiled
 def _vertex(values: Array, k: int, sign: float) -> tuple[float, float]:
-    """Place near sample k where the parabola through it and its neighbours is extreme, and that value.
+    """Place and value of the extremum of the parabola through sample k and its neighbours.
 
-    The parabola runs over the samples' numbers, in which their places are smooth.
+    The parabola is a function of the sample's index, of which the places are a smooth function.
     """
     last = len(values) - 1
     middle = min(max(k, 1), last - 1)
@@ -173,9 +173,9 @@ def sampled(coefficients: Array, heading: Array, durations: Array, mass: float, 
 
     Args:
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
-        heading: of `plan_headings`.
+        heading: from `plan_headings`.
         durations: shape (f,) [s].
-        mass, J, mixing: of `rotor_model`.
+        mass, J, mixing: from `rotor_model`.
 
     Returns:
         (thrusts, row): thrusts, shape (f, 4, 49) [N]; row: least and its time, greatest and its time, refined between
@@ -218,8 +218,8 @@ def _functions(program: ProgramArrays, segment: int, at: Indices) -> Array:
 
     Args:
         program: of `reduced_qp.assemble`.
-        segment: its number.
-        at: numbers of the places, shape (n,).
+        segment: its index.
+        at: indices of the places, shape (n,).
 
     Returns:
         Shape (3 n, size + 3), by derivative, then by place.
@@ -242,12 +242,12 @@ def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients:
 
     Args:
         program: of `reduced_qp.assemble`.
-        thrusts, row: of `sampled`; what lies beyond the limits between the places is made up for at the places.
+        thrusts, row: from `sampled`; extrema between the places tighten the bounds at the places.
         coefficients, heading, mass, J, mixing: as for `sampled`.
         low, high: limits of a rotor's thrust [N].
 
     Returns:
-        (keys, rows): for each rotor and place near a limit an ascending number that names segment, place and rotor, and a row of w.
+        (keys, rows): for each rotor and place near a limit, an ascending key of segment, place and rotor, and a row of w.
     """
     durations, m = program[0], len(program[3])
     near, keep = _NEAR * (high - low), _KEEP * (high - low)

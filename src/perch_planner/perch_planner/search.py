@@ -30,12 +30,12 @@ _GROWTH = (1.25, 1.6)  # then by more
 
 
 class Attempt(NamedTuple):
-    """One quadratic program on the way to a plan.
+    """One quadratic program of a search.
 
     Attributes:
         duration: of the whole plan [s].
         thrust_min, thrust_max: proved extrema of the collective thrust [N]; nan where the program had no solution.
-        cuts: linear bounds in the program.
+        cuts: number of linear bounds added so far for these durations.
     """
 
     duration: float
@@ -45,7 +45,7 @@ class Attempt(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a set of durations [s] gave: a plan whose limits are proved, or one whose are not, and how much longer to try.
+    """Result for a set of durations [s]: a plan, whether its limits are proved, and the factor by which to stretch it.
 
     Coefficients, yaw and results are empty where there are none.
     """
@@ -60,12 +60,12 @@ class Outcome(NamedTuple):
 
 
 def turn(fails: int) -> int:
-    """The number in `FINE` of the division of the approach that is tried after so many have failed; len(FINE): the coarse one."""
+    """Index in `FINE` of the division of the approach to try after `fails` failures; len(FINE): the coarse division."""
     return len(FINE) if fails < _COARSE else (fails - _COARSE) % (len(FINE) + 1)
 
 
 def divided(durations: np.ndarray, fails: int) -> np.ndarray:
-    """The segments that are tried after so many divisions of the approach have failed [s]."""
+    """Durations of the segments to try after `fails` divisions of the approach have failed [s]."""
     return split_last(durations) if turn(fails) == len(FINE) else split_finely(durations, FINE[turn(fails)])
 
 
@@ -87,18 +87,18 @@ class Search:
         self.rotors = (*limits.rotor_thrust, *rotor_model(vehicle))
         self.attempts: list[Attempt] = []
         self.acted = {"tangential_speed_max", "clearance_min"}
-        """Settings whose limits had an influence on the search: those of rows that every program has, and those that plans left."""
+        """Settings whose limits influenced the search: those in the rows of every program, and those that plans violated."""
 
     @property
     def iterations(self) -> int:
         return len(self.attempts)
 
     def try_durations(self, durations: np.ndarray, patient: bool = False) -> Outcome:
-        """Solve and cut for fixed durations until every limit is proved or nothing helps.
+        """Solve and cut for fixed durations until every limit is proved or cuts do not help.
 
         Args:
             durations: [s], shape (f,).
-            patient: give up early where longer durations promise more than cuts.
+            patient: stop early where longer durations promise more than cuts.
         """
         settings, start = self.settings, self.problem.start
         nothing = Outcome(durations)
@@ -133,7 +133,7 @@ class Search:
         return best._replace(stretch=_PLAIN_STRETCH) if best and count else best or nothing
 
     def _thrust(self, durations: np.ndarray, found: Judgement) -> Outcome | None:
-        """The outcome where the thrust leaves its range, or None."""
+        """Return the outcome where the thrust leaves its range, else None."""
         if found.most <= self.high and found.least >= self.low:
             return None
         return Outcome(durations, found.coefficients, stretch=stretch_factor(found.most, self.high), extrema=found.extrema)
@@ -143,7 +143,7 @@ class Search:
         self.attempts.append(Attempt(duration, mass * least, mass * most, cuts))
 
     def _remember(self, found: Judgement) -> None:
-        """Note which limits a plan leaves."""
+        """Record which limits a plan violates."""
         left = {"thrust_min": found.least < self.low, "thrust_max": found.most > self.high, "rotor_margin": not found.kept}
         if found.checked:
             results, (floor, ceiling) = found.results, self.limits.height
@@ -152,10 +152,11 @@ class Search:
         self.acted |= {name for name, left_it in left.items() if left_it}
 
     def run(self) -> tuple[np.ndarray, Outcome]:
-        """Lengthen until every limit is proved, or the time or the number of programs is used up. [M:IV-C.3]
+        """Lengthen durations until every limit is proved, or the time or the number of programs is exhausted. [M:IV-C.3]
 
-        Where the thrust fails before the last waypoint everything becomes longer, else the approach, from the third on after all
-        divisions of it. What is longer than `duration_max` is shortened to it, once, and tried with all divisions.
+        Where the thrust leaves its range before the last waypoint, all segments grow; otherwise mainly the approach, from the
+        third try on only after all its divisions failed. Longer durations are shortened to `duration_max` once, and tried with
+        all divisions.
         """
         durations, best, stretched, fails, last = self.first, None, 0, 0, False
         while True:
@@ -185,7 +186,7 @@ class Search:
 
         Args:
             durations: of the problem's segments, shape (waypoints + 1,).
-            outcome: what they gave.
+            outcome: result for these durations.
         """
         if outcome.extrema is None:
             return False

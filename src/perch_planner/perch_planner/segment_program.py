@@ -24,7 +24,7 @@ COST_ORDER = {"snap": 4, "jerk": 3}
 @compiled
 def _prepare(durations: Array, yaw: Array, velocity: Array, problem: tuple[Any, ...], everywhere: bool, gram: Array, cost_order: int
              ) -> tuple[tuple[Indices, float, Array, Array], Rows, Array]:
-    """Program, rows of tube and window, and headings in one call: several calls cost more than they compute."""
+    """Prepare program, rows of tube and window, and headings in one call, as the overhead of calls exceeds the computation."""
     given, values, bubbles, bounds = conditions(durations, everywhere, velocity, problem)
     program = assemble(durations, given, values, bubbles, gram, cost_order)
     return program[1:], rows_of(program, bounds), plan_headings(yaw, durations)
@@ -32,7 +32,7 @@ def _prepare(durations: Array, yaw: Array, velocity: Array, problem: tuple[Any, 
 
 @compiled
 def _carried(keys: Indices, dual: Array, to: Indices) -> Array:
-    """Multipliers of rows with ascending keys, for rows with other ascending keys; zero where there was none."""
+    """Transfer multipliers of rows with ascending keys to rows with other ascending keys; zero for new keys."""
     out, i = np.zeros(len(to)), 0
     for k in range(len(to)):
         while i < len(keys) and keys[i] < to[k]:
@@ -45,17 +45,17 @@ def _carried(keys: Indices, dual: Array, to: Indices) -> Array:
 @compiled
 def _judged(program: ProgramArrays, rows: Rows, keys: Indices, w: Array, dual: Array, yaw: Array, heading: Array,
             question: tuple[Any, ...], rotors: Rotors, patient: bool, later: bool, turning: bool) -> tuple[tuple[Any, ...], Rows, Indices, Array]:
-    """A solution's plan, what it is worth, and the next program.
+    """Evaluate the plan of a solution, and build the next program.
 
     Args:
         program: of `reduced_qp.assemble`.
-        rows: of the program that was solved; the last ones, one for each of `keys`, hold near its plan alone.
+        rows: of the solved program; the last ones, one for each of `keys`, are valid near its plan only.
         w, dual: its solution.
         yaw, heading, question, rotors, patient, later: as for `judgement.judge`.
-        turning: a rotor has left its range before.
+        turning: an earlier plan did not keep the rotor range.
 
     Returns:
-        (fields of `Judgement`, rows and keys of the next program, multipliers where it may start).
+        (fields of `Judgement`, rows and keys of the next program, multipliers for its warm start).
     """
     plan = coefficients(program, w)
     extrema, results, found, thrust, other, thrusts = judge(plan, yaw, heading, program[0], question, rotors, patient, later)
@@ -90,10 +90,10 @@ class SegmentProgram:
         self._keys: Indices = np.empty(0, np.int64)  # of rows that hold near the present plan alone
         self._dual: Array | None = None
         self.turning = False
-        """A rotor has left its range."""
+        """Whether a plan of this program did not keep the rotor range."""
 
     def judged(self, patient: bool, later: bool) -> Judgement | None:
-        """Solve, judge the plan and add the bounds that were found; None where the program has no solution.
+        """Solve, check the plan and add the bounds that were found; None where the program has no solution.
 
         Args:
             patient, later: as for `judgement.judge`.

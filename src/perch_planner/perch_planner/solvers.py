@@ -1,8 +1,8 @@
-"""Quadratic programs in the whitened form behind one interface; no answer is believed before its residual is known.
+"""Solvers of quadratic programs in whitened form behind one interface; the residual of every solution is checked.
 
 Every solver minimises |w|^2 under `lower <= rows @ w <= upper`. DAQP is the default: an active-set method that is
-exact and the fastest here (0.06-0.13 ms against 2-4 ms for OSQP at the same accuracy); it returned "solved" with
-violated rows when they were not scaled, hence the check.
+exact and the fastest here (0.06-0.13 ms against 2-4 ms for OSQP at the same accuracy). On unscaled rows it can report
+"solved" although rows are violated, hence the check.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ _LONGEST = _TOLERANCE / np.finfo(float).eps  # |w| for which the rounding of a r
 
 
 class Solution(NamedTuple):
-    """Answer of a solver.
+    """Result of a solver.
 
     Attributes:
         w: minimiser, shape (n,); meaningless unless `solved`.
         solved: the residual was checked and is within `FEASIBILITY`.
         residual: largest violation of a row.
-        status: the solver's own word.
-        dual: multipliers of the rows, shape (r,), where the next program may start; None: the solver gives none.
+        status: status text of the solver.
+        dual: multipliers of the rows, shape (r,), a warm start for the next program; None: the solver provides none.
     """
 
     w: Array
@@ -41,7 +41,7 @@ class Solution(NamedTuple):
 
 @compiled
 def _residual(rows: Array, lower: Array, upper: Array, w: Array) -> float:
-    """Largest violation of a row; infinite where the answer is not finite."""
+    """Largest violation of a row; infinite where the solution is not finite."""
     value = rows @ w
     worst = 0.0
     for k in range(len(value)):
@@ -95,13 +95,13 @@ SOLVERS: dict[str, Callable[[Array, Array, Array, Array | None], tuple[Array, st
 
 
 def least_norm(rows: Array, lower: Array, upper: Array, solver: str = "daqp", dual: Array | None = None) -> Solution:
-    """The shortest w with `lower <= rows @ w <= upper`. [defines M:eq8, in whitened coordinates]
+    """Return the shortest w with `lower <= rows @ w <= upper`. [defines M:eq8, in whitened coordinates]
 
     Args:
         rows: rows of unit length, shape (r, n).
         lower, upper: bounds, infinite where there is none, shape (r,).
         solver: `daqp` or `osqp`.
-        dual: where DAQP starts, multipliers of a similar program; None: without active rows.
+        dual: warm start of DAQP, the multipliers of a similar program; None: start without active rows.
     """
     if _contains_zero(lower, upper):
         return Solution(np.zeros(rows.shape[1]), True, 0.0, "unconstrained optimum")

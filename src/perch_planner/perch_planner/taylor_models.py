@@ -1,11 +1,11 @@
-"""Taylor models of second order in time, as tuples of floats for compiled code: what proves that a function keeps its limits.
+"""Taylor models of second order in time, as tuples of floats for compiled code, to prove that a function keeps its limits.
 
 A number (m, d, c, e) stands for a function x on [-1, 1]: m = x(0), d = x'(0), and |x'' - c| <= e everywhere. So
 
     x(t) = m + d t + k t^2 / 2   for a k in [c - e, c + e] that depends on t.
 
-Arithmetic keeps this (Makino and Berz, 2003; here with rigorous second derivatives instead of remainders). Rounding is not followed:
-whoever concludes something from a bound widens it by `ROUNDING`. Functions have no branches and become part of the loop that calls them.
+Arithmetic preserves this (Makino and Berz, 2003; here with rigorous second derivatives instead of remainders). Rounding errors
+are not tracked: the caller widens a bound by `ROUNDING`. Functions have no branches and are inlined into the calling loop.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def times(k: float, a: Taylor) -> Taylor:
 
 @compiled(inline=True)
 def mul(a: Taylor, b: Taylor) -> Taylor:
-    """`a b`; (a b)'' = a'' b + 2 a' b' + a b'', and each of these reaches at most the product of the sizes."""
+    """`a b`; (a b)'' = a'' b + 2 a' b' + a b'', and each term is at most the product of the sizes."""
     a0, a1, a2 = sizes(a)
     b0, b1, b2 = sizes(b)
     p, q, r = a[2] * b[0], a[1] * b[1], a[0] * b[2]
@@ -73,7 +73,7 @@ def mul(a: Taylor, b: Taylor) -> Taylor:
 
 @compiled(inline=True)
 def chained(value: float, slope: float, slope_reach: float, bend: float, bend_reach: float, a: Taylor) -> Taylor:
-    """g(a) from g, g', g'' at m and how far g' and g'' get from there; g(a)'' = g'' a'^2 + g' a''."""
+    """g(a) from g, g', g'' at m and the greatest deviations of g' and g'' from there; g(a)'' = g'' a'^2 + g' a''."""
     _, a1, a2 = sizes(a)
     p, q = bend * a[1] * a[1], slope * a[2]
     return (value, slope * a[1], p + q,
@@ -82,7 +82,7 @@ def chained(value: float, slope: float, slope_reach: float, bend: float, bend_re
 
 @compiled(inline=True)
 def inverse_root(a: Taylor) -> Taylor:
-    """`a^(-1/2)` where `least(a)` is positive; its derivatives are monotonic, so they differ most from those at the middle where a is least or greatest."""
+    """`a^(-1/2)` where `least(a)` is positive; its derivatives are monotonic, so they deviate most at the extrema of a."""
     here, most, fewest = 1.0 / sqrt(max(a[0], _POSITIVE)), 1.0 / sqrt(max(least(a), _POSITIVE)), 1.0 / sqrt(max(greatest(a), _POSITIVE))
     return chained(here, -0.5 * here**3, 0.5 * max(most**3 - here**3, here**3 - fewest**3),
                    0.75 * here**5, 0.75 * max(most**5 - here**5, here**5 - fewest**5), a)

@@ -1,4 +1,4 @@
-"""First durations of the segments, and how they grow."""
+"""Initial durations of the segments, and their growth."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def _turn(points: Array, legs: Array, i: int) -> float:
 @compiled
 def _along_waypoints(points: Array, v_start: Array, v_end: Array, speed: float, acceleration: float, turn_acceleration: float,
                      last_least: float) -> Array:
-    """Durations between points: a trapezoidal speed profile over the whole way, slowed down for the turns, and longer by
-    the time that the difference of the end velocities takes.
+    """Durations between points, from a trapezoidal speed profile over the whole way.
 
-    The speed at a waypoint is bounded by v^2 = A l / turn, with the shorter leg l and the change of direction there.
+    The profile is slowed down for the turns and lengthened for the difference of the end velocities. The speed at a waypoint
+    is bounded by v^2 = A l / turn, with the shorter leg l and the change of direction there.
     """
     n = len(points) - 1
     extra = _distance(v_end, v_start) / acceleration
@@ -75,12 +75,12 @@ def _along_waypoints(points: Array, v_start: Array, v_end: Array, speed: float, 
 
 
 def allocate(problem: PerchProblem, settings: PerchSettings, points: np.ndarray) -> np.ndarray:
-    """First durations: those of the problem, or a speed profile along the waypoints.
+    """Initial durations: those of the problem, or of a speed profile along the waypoints.
 
     Args:
         problem: start, waypoints, target velocity.
-        settings: bounds on the last segment and the whole.
-        points: start, waypoints, and the contact if the target stood still [m], shape (waypoints + 2, 3).
+        settings: its tube time is a lower bound of the last segment.
+        points: start, waypoints, and the contact with a static target [m], shape (waypoints + 2, 3).
 
     Returns:
         Durations [s], shape (len(waypoints) + 1,).
@@ -92,14 +92,14 @@ def allocate(problem: PerchProblem, settings: PerchSettings, points: np.ndarray)
 
 
 def with_last_segment(durations: np.ndarray, settings: PerchSettings) -> np.ndarray:
-    """The durations with a last segment that is long enough for the tube: a shorter one is often infeasible."""
+    """Return the durations with a last segment that is long enough for the tube: a shorter one is often infeasible."""
     durations = durations.copy()
     durations[-1] = max(durations[-1], settings.tube_time, LAST_SEGMENT_MIN)
     return durations
 
 
 def shortened(durations: np.ndarray, settings: PerchSettings) -> np.ndarray | None:
-    """Longer durations shortened to `duration_max`, all by one factor but for the least last segment; None: there is no room for them."""
+    """Scale longer durations down to `duration_max`, by one factor except for the least last segment; None: they do not fit."""
     out = with_last_segment((settings.duration_max - _ROUNDING) / durations.sum() * durations, settings)
     before, room = out[:-1], settings.duration_max - out[-1]
     if room < SEGMENT_MIN * len(before):
@@ -111,10 +111,10 @@ def shortened(durations: np.ndarray, settings: PerchSettings) -> np.ndarray | No
 
 @compiled
 def split_last(durations: Array) -> Array:
-    """Divide a long last segment by knots at which nothing is given.
+    """Divide a long last segment by knots without conditions.
 
-    One polynomial over a long way is too stiff for the rotation at its end: without the knot no plan keeps a 0.25 kg
-    vehicle under 4.05 N above 105 degrees, with it every inclination is reached.
+    One polynomial over a long way is too stiff for the rotation at its end: without the knot no plan keeps the thrust of
+    a 0.25 kg vehicle below 4.05 N at inclinations above 105 degrees; with it every inclination is reached.
     """
     last, before = durations[-1], len(durations) - 1
     if last < 2.0 * FINAL_TIME:
@@ -134,10 +134,10 @@ def split_last(durations: Array) -> Array:
 
 @compiled
 def split_finely(durations: Array, pieces: Array) -> Array:
-    """Divide the last segment so that it ends with given pieces [s], at whose ends nothing is given.
+    """Divide the last segment so that it ends with given pieces [s], with knots without conditions.
 
-    A polynomial that turns the vehicle for 0.45 s asks the rotors for less than they have nearly everywhere, to stay within what they
-    have at one instant; shorter pieces follow their limits more closely.
+    With one polynomial for the 0.45 s of the rotation, the rotor limits bind at one instant and are not used elsewhere; shorter
+    pieces follow the limits more closely.
     """
     run_up, before = durations[-1] - pieces.sum(), len(durations) - 1
     if run_up < FINAL_TIME:
@@ -149,7 +149,7 @@ def split_finely(durations: Array, pieces: Array) -> Array:
 
 
 def lengthen_approach(durations: np.ndarray, factor: float) -> np.ndarray:
-    """More time for the last segment, where the run-up and the rotation have to happen, and a little for the rest."""
+    """Lengthen the last segment, which holds the run-up and the rotation, and slightly the others."""
     grown = 1.05 * durations
     grown[-1] = max(factor * durations[-1], 2.2 * FINAL_TIME)
     return grown

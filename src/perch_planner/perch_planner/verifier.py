@@ -1,8 +1,8 @@
 """An independent check of a perching plan, from its published coefficients alone.
 
-Nothing here comes from the planner: the trajectory is re-made as power series in exact rationals from the coefficients
-of the message, sampled densely for attitude and body rate by finite differences of rotations, and its extrema are
-taken from the roots of derivatives (numpy's eigenvalue method), where the planner subdivides Bernstein coefficients.
+No code of the planner is used: the trajectory is rebuilt as power series in exact rationals from the
+coefficients of the message. Attitude and body rate are sampled densely, by finite differences of rotations. Extrema are taken
+from the roots of derivatives (numpy's eigenvalue method), whereas the planner subdivides Bernstein coefficients.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _TURN = 1e-4  # [s] between the rotations from which rates and accelerations are
 
 @dataclass(frozen=True)
 class Rotors:
-    """What the rotors must keep.
+    """Requirements on the single rotors.
 
     Attributes:
         inertia: principal moments [kg m^2], shape (3,).
@@ -41,7 +41,7 @@ class Rotors:
 
 @dataclass(frozen=True)
 class Requirements:
-    """What a plan must keep, in plain numbers.
+    """Requirements on a plan, in plain numbers.
 
     Attributes:
         start: position, velocity, acceleration, jerk at time 0, shape (4, 3).
@@ -54,8 +54,8 @@ class Requirements:
         impact_acceleration: alpha [m/s^2].
         impact_speed: least and greatest speed along -s3 [m/s].
         tangential_speed: greatest speed over the surface at contact [m/s].
-        contact_delay: both hold at the planned contact, and so long after it [s] with the acceleration that the vehicle has there,
-            where this changes the speed, or the slip, by less than its bounds are apart.
+        contact_delay: both speeds also hold for a contact delayed by this time [s] at constant acceleration, unless the change of
+            the speed exceeds the width of its bounds.
         tube: t_k [s], dt [s], q, least half width [m/s^2].
         thrust: least and greatest [N].
         body_rate: greatest [rad/s].
@@ -95,14 +95,14 @@ Axes = tuple[Array, Array, Array]
 
 
 class Equal(Protocol):
-    """Notes where a value is not the one that is wanted."""
+    """Records a finding where a value differs from the required one."""
 
     def __call__(self, name: str, value: Any, wanted: Array, t: float, slack: float = 1.0) -> None: ...
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A requirement that a plan breaks: its name, by how much, and when [s]."""
+    """A violated requirement: its name, the excess, and the time [s]."""
 
     requirement: str
     excess: float
@@ -110,7 +110,7 @@ class Finding:
 
 
 def _powers(bernstein_row: Numbers) -> Array:
-    """Ascending powers of s, in exact integers over one power of two."""
+    """Coefficients of ascending powers of s, computed in exact integers over one power of two."""
     n = len(bernstein_row) - 1
     ratios = [float(c).as_integer_ratio() for c in bernstein_row]
     scale = max(denominator for _, denominator in ratios)
@@ -176,7 +176,7 @@ def _turn(before: Axes, after: Axes) -> Array:
 
 
 def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 1e-4) -> list[Finding]:
-    """Check a plan against everything that was asked.
+    """Check a plan against all requirements.
 
     Args:
         durations: segment durations [s].
@@ -185,7 +185,7 @@ def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 
         step: sampling of the dense check [s].
 
     Returns:
-        What is broken; empty for a good plan.
+        The violated requirements; empty for a valid plan.
     """
     found: list[Finding] = []
     pieces = [_Segment(d, rows) for d, rows in zip(durations, segments)]
@@ -230,7 +230,7 @@ def _check_knots(pieces: list[_Segment], begins: Array, need: Requirements, equa
 
 
 def _check_impact(v: Array, later: Array, need: Requirements, end: float, at_most: AtMost) -> None:
-    """Speed and slip of a contact on time, and of one after a change of the velocity by `later` where the bounds leave room for both."""
+    """Check speed and slip of a contact on time, and of one after a velocity change `later` where the bounds permit both."""
     axes, (least, most) = np.array([-need.s3, need.s1, need.s2]), need.impact_speed
     on_time, change = axes @ v, axes @ later
     slide = float(np.hypot(*change[1:]))
@@ -257,7 +257,7 @@ def _check_tube(pieces: list[_Segment], begins: Array, need: Requirements, conta
 
 
 def _check_exact(piece: _Segment, begin: float, need: Requirements, at_most: AtMost) -> None:
-    """Extrema of polynomials, from roots."""
+    """Check the extrema of polynomials, computed from roots."""
     low, high = _extrema(lambda s: np.linalg.norm(piece.force(s), axis=1) ** 2, 26)
     at_most("thrust, greatest [M:eq16]", need.mass * max(high, 0.0) ** 0.5, need.thrust[1], begin, 1e-9)
     at_most("thrust, least [M:eq16]", need.thrust[0], need.mass * max(low, 0.0) ** 0.5, begin, 1e-9)
@@ -269,7 +269,7 @@ def _check_exact(piece: _Segment, begin: float, need: Requirements, at_most: AtM
 
 
 def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float, at_most: AtMost) -> None:
-    """Body rate and clearance on samples; the body rate from rotations half a step apart."""
+    """Check body rate and clearance on samples; the body rate from rotations half a step apart."""
     count = max(int(np.ceil(piece.duration / step)), 2)
     s = (np.arange(count) + 0.5) / count
     h = 0.25 / count
@@ -294,7 +294,7 @@ def _turn_rates(before: Axes, after: Axes, step: float) -> Array:
 
 
 def _check_rotors(piece: _Segment, begin: float, need: Requirements, rotors: Rotors, step: float, at_most: AtMost) -> None:
-    """Rotor thrusts on samples: Euler's equation with rates and accelerations from three rotations `_TURN` apart."""
+    """Check rotor thrusts on samples: Euler's equation with rates and accelerations from three rotations `_TURN` apart."""
     h = _TURN / piece.duration
     count = max(int(np.ceil(piece.duration / step)), 2)
     s = h + (np.arange(count) + 0.5) / count * (1.0 - 2.0 * h)

@@ -1,8 +1,8 @@
-"""Ways out of a perch: from a state in motion to a hover in front of the surface, with the limits and proofs of a plan.
+"""Ways out of a perch: abort trajectories from a state in motion to a hover in front of the surface, with proved limits.
 
-A way out ends at rest where a stop of least snap from the start would end, kept away from the surface, the floor and the ceiling.
-It is short, so that no durations are searched for: a few are tried, the gentle one first, then with a knot early on, since a
-vehicle that is already turned to the surface has to turn back at once.
+A way out ends at rest at the end point of a minimum-snap stop from the start, kept away from surface, floor and ceiling.
+It is short, so durations are not searched for: three are tried, first without and then with an early knot, since a vehicle that
+is already tilted to the surface has to turn back at once.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CODES = {"body_rate": refusals.BODY_RATE, "thrust": refusals.THRUST_FLOOR, "rot
 
 
 class _Hover(Contact):
-    """Rest at a place [m] at the end: no impact window, no tube."""
+    """End conditions of a hover at a place [m]: at rest, without impact window and tube."""
 
     def __init__(self, problem: PerchProblem, settings: PerchSettings, place: np.ndarray) -> None:
         start = problem.start
@@ -39,9 +39,9 @@ class _Hover(Contact):
 
 
 def hover_place(problem: PerchProblem, limits: Limits, duration: float) -> np.ndarray:
-    """Where a way out ends [m], shape (3,).
+    """Position at which a way out ends [m], shape (3,).
 
-    A stop of least snap has the quintic velocity with the start's v, a and j and rest at the end; its integral is the first term.
+    The velocity of a minimum-snap stop is the quintic from the start's v, a and j to rest; its integral is the first term.
     """
     start, surface = problem.start, problem.surface
     place = start.p + duration * (start.v / 2.0 + duration * (start.a / 10.0 + duration * start.j / 120.0))
@@ -63,7 +63,7 @@ def plan_way_out(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
         A plan that keeps every limit, each with its proof.
 
     Raises:
-        PerchRefusal: none was found; with the limit that the last one breaks.
+        PerchRefusal: no way out was found; carries a limit that the last checked one violates.
     """
     begin, limits = perf_counter(), Limits.of(settings, vehicle)
     search = Search(problem, replace(settings, objective="jerk"), vehicle, limits)
@@ -80,7 +80,7 @@ def plan_way_out(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
 
 
 def _refusal(best: Outcome | None, search: Search, limits: Limits, mass: float) -> PerchRefusal:
-    """Why there is no way out: a limit that the last stop breaks."""
+    """Return the refusal of a way out, with a limit that the last checked stop violates."""
     if best is None or not len(best.results):
         return PerchRefusal(refusals.THRUST_FLOOR, "thrust range [M:eq16]", -np.inf, "no way out: no stop keeps the thrust within its range",
                             iterations=search.iterations)

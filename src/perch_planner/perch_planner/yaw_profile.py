@@ -1,4 +1,4 @@
-"""The fourth flat output: from the heading at the start to that of the surface. [M:eq4, M:eq12]
+"""Profile of the fourth flat output, yaw, from the heading at the start to that of the surface. [M:eq4, M:eq12]
 
 No constraint couples yaw to the position, and waypoints leave it free: its own QP [M:eq8] has the end conditions
 alone, and its optimum is one polynomial over the whole plan (degree 7 for snap, 5 for jerk), known in closed form.

@@ -1,8 +1,8 @@
-"""Whether the geometric law can fly a contact trajectory: its flight on the vehicle's model, compiled.
+"""Check whether the geometric law can fly a contact trajectory, by a compiled simulation on the vehicle's model.
 
-A plan keeps the limits of the rotors' thrusts, and does not know their lag. Where b3 has to turn far and the thrust at the contact is
-low, as under an overhang, following the plan takes commands beyond the rotors' range: the law would end slower, faster or elsewhere
-than planned, in the same way each time. That is known before the flight.
+A plan respects the limits of the rotors' thrusts, but not their lag. Where b3 has to turn far and the thrust at the contact is
+low, as under an overhang, following the plan requires commands beyond the rotors' range: the law would end slower, faster or
+elsewhere than planned, in the same way each time. This can be computed before the flight.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SPAN = 1.5  # the last part of the trajectory is flown [s]
 
 @compiled
 def flown(start, speed, table, gains, limits, narrow, window, lead, lag, period, vehicle):
-    """State at the end of a flight of the geometric controller on the nominal vehicle; see `GeometricController.end_on_model`."""
+    """State at the end of a simulated flight of the geometric controller; see `GeometricController.end_on_model`."""
     state, command = start, speed
     duration, mass, J = len(table) * period, vehicle[0][0], vehicle[0][1:4]
     coefficient, _, _, tau = vehicle[1]
@@ -52,14 +52,14 @@ def flown(start, speed, table, gains, limits, narrow, window, lead, lag, period,
 
 
 def miss(source: Source, controller: GeometricController) -> tuple[float, float]:
-    """By how much the law misses the end of a trajectory on the nominal vehicle, from its state `SPAN` before the end on.
+    """Error of the law at the end of a trajectory on the vehicle model, simulated from the reference `SPAN` before the end on.
 
     Args:
         source: the trajectory.
         controller: the law, with its vehicle, gains and period.
 
     Returns:
-        Distance from the planned end [m], and from its velocity [m/s].
+        Difference from the planned position [m] and velocity [m/s] at the end.
     """
     T, period = source.duration, controller.period
     n = int(min(SPAN, T) / period)

@@ -1,4 +1,4 @@
-"""The geometric controller as an object without hidden state: vehicle and gains in, one call per control period."""
+"""Geometric controller as an object without hidden state: built from vehicle and gains, called once per control period."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ACCELERATION_MAX = 250.0  # bound of the commanded angular acceleration: what th
 
 
 def packed_vehicle(vehicle: Vehicle) -> tuple:
-    """The vehicle's constants as nested tuples of floats, as `control_step` takes them."""
+    """Return the vehicle's constants as nested tuples of floats, in the form of `control_step`."""
     forward = tuple(tuple(float(v) for v in row) for row in vehicle.allocation[1:])
     return (
         (float(vehicle.mass), *(float(j) for j in vehicle.inertia)),
@@ -59,12 +59,12 @@ class GeometricController(Law):
 
     @classmethod
     def build(cls, vehicle: Vehicle, params: ControllerParameters) -> GeometricController:
-        """With the gains of the parameters."""
+        """Build the law with the gains of the parameters."""
         return cls(vehicle, params.gain_set)
 
     @property
     def lag(self) -> float:
-        """By which the rotors follow: the state is predicted, and the reference wanted, this far ahead [s]."""
+        """Lag of the rotors behind their wanted speeds; state and reference are evaluated this far ahead [s]."""
         return lag_behind(self.vehicle.motor_time_constant, self.gains.lead, self.period)
 
     def control(self, state: tuple[float, ...], reference: Following, rotors: RotorEstimate,
@@ -79,9 +79,9 @@ class GeometricController(Law):
         Args:
             state: p_WB [m], v_WB [m/s] in W, q_WB xyzw, w_WB_B [rad/s], 13 floats.
             reference: setpoint `lag` seconds from now, 33 floats (see `Setpoint.packed`).
-            rotors: rotor speeds and what they are following.
-            compensation: acceleration in W and angular acceleration in B that make up for disturbances, 6 floats.
-            time_to_contact: [s]; near zero position feedback gives way to attitude.
+            rotors: rotor speeds and their commands.
+            compensation: acceleration in W and angular acceleration in B that compensate for disturbances, 6 floats.
+            time_to_contact: [s]; near zero, position feedback is reduced in favour of the attitude.
         """
         share = min(max(time_to_contact / CONTACT_WINDOW, 0.0), 1.0)
         cone = self._narrow + share * (self._wide - self._narrow)
@@ -93,18 +93,18 @@ class GeometricController(Law):
         return (FEEDBACK_MAX, cone, THRUST_FLOOR, self._rate_max, ACCELERATION_MAX)
 
     def believe(self, vehicle: Vehicle) -> None:
-        """Fly a vehicle that differs from the one at the start in its thrust."""
+        """Use a vehicle model that differs from the initial one in its thrust."""
         self.vehicle, self._vehicle = vehicle, packed_vehicle(vehicle)
 
     def check_contact(self, source: Source) -> None:
-        """As `Law.check_contact`, by a flight on the model of the vehicle (`contact_check.py`)."""
+        """As `Law.check_contact`, by a simulation on the vehicle model (`contact_check.py`)."""
         distance, speed = miss(source, self)
         if distance > CONTACT_MISS or speed > CONTACT_SPEED_MISS:
             raise TrajectoryRefused(f"on its model the geometric law misses the contact by {100 * distance:.1f} cm and {speed:.2f} m/s: "
                                     "the rotors cannot follow this plan; the NMPC (controller.type: nmpc) may fly it")
 
     def end_on_model(self, start: np.ndarray, rotors: RotorEstimate, table: np.ndarray) -> np.ndarray:
-        """State in which this controller ends a contact trajectory on the nominal vehicle.
+        """Simulate a contact trajectory with this controller on its vehicle model.
 
         Args:
             start: state at the beginning, shape (13,).

@@ -1,7 +1,7 @@
 """One step of geometric tracking control on SE(3), scalar by scalar. [M:eq2, M:eq12, M:eq13]
 
 The commanded attitude follows from the force f that position feedback and feed-forward demand; the commanded body rates
-and angular accelerations are those with which the reference's force turns.
+and angular accelerations are those of the reference's force direction.
 
 All arguments and results are tuples of floats (see `vector3`); accelerations and forces are per unit of mass.
 """
@@ -26,14 +26,14 @@ def position_feedback(e_p, e_v, k_p, k_v, bound):
 def force_about(a_ref, feedback, axis, tilt_tangent, floor):
     """Specific force f within a cone about the reference's thrust direction. [M:eq10]
 
-    The feedback may turn the thrust away from the reference's direction only so far; so it can neither turn the vehicle over nor
-    choose a direction out of noise where the thrust is low. A small thrust cannot push sideways much, however far it is turned:
-    below the weight the cone narrows with it, so that near free fall the planned attitude is flown and nothing else.
+    The feedback may turn the thrust away from the reference's direction only within the cone; so it can neither turn the vehicle
+    over nor follow noise where the thrust is low. A small thrust has little lateral effect at any angle: below the weight, the
+    cone narrows in proportion to it, so that near free fall only the planned attitude is flown.
 
     Args:
         a_ref: acceleration of the reference in W [m/s^2].
-        feedback: acceleration demanded on top [m/s^2].
-        axis: direction of the reference's thrust, or the vehicle's own b3 where that is in free fall, which asks for no rotation.
+        feedback: acceleration that is added to it [m/s^2].
+        axis: direction of the reference's thrust; in free fall the vehicle's own b3, which demands no rotation.
         tilt_tangent: tangent of the cone's half angle.
         floor: least part of f along the axis [m/s^2].
 
@@ -55,10 +55,10 @@ def force_about(a_ref, feedback, axis, tilt_tangent, floor):
 def attitude_error(q, q_C):
     """Attitude error e_R in B [rad]. [M:eq2]
 
-    `2 sin(angle / 2) axis` of the two rotations that q_C^-1 q is made of: the shortest one between both b3, and what is left
-    about b3. To first order that is the paper's `vee(R_C^T R - R^T R_C) / 2`, but it keeps growing up to 180 degrees, so an
-    inverted vehicle is turned back; and a heading that is far off does not turn the tilt error aside: with one common axis a vehicle that
-    spins is tilted in a spiral.
+    `2 sin(angle / 2) axis` of the two rotations that compose q_C^-1 q: the shortest one between both b3, and the remaining one
+    about b3. To first order that is the paper's `vee(R_C^T R - R^T R_C) / 2`, but it grows up to 180 degrees, so that an inverted
+    vehicle is turned back. A large heading error does not deflect the tilt error: with one common axis, a spinning vehicle would
+    be tilted in a spiral.
     """
     e = quaternion_product((-q_C[0], -q_C[1], -q_C[2], q_C[3]), q)
     upright = sqrt(e[2] * e[2] + e[3] * e[3])
@@ -79,7 +79,7 @@ def moment(w, e_R, w_C_B, dw_C_B, J, k_R, k_w, dw_extra):
         w_C_B, dw_C_B: commanded body rates and accelerations turned into B, R^T R_C w_C and R^T R_C dw_C.
         J: principal moments of inertia [kg m^2].
         k_R, k_w: gains [1/s^2, 1/s]; k_R and k_Omega of the paper are J k_R and J k_w.
-        dw_extra: angular acceleration that makes up for a known disturbance [rad/s^2].
+        dw_extra: angular acceleration that compensates for a known disturbance [rad/s^2].
     """
     e_w = axpy(-1.0, w_C_B, w)
     Jw = times(J, w)
@@ -100,7 +100,7 @@ def geometric_step(state, reference, extra, gains, limits, J):
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
         reference: p, v, a, j, s in W, then b2_des and b3 (zero: follows from the force) with their first two derivatives,
             33 floats.
-        extra: acceleration in W and angular acceleration in B that make up for known disturbances, 6 floats.
+        extra: acceleration in W and angular acceleration in B that compensate for known disturbances, 6 floats.
         gains: k_p, k_v, k_R, k_w, 12 floats.
         limits: bound of the position feedback [m/s^2], tangent of its cone, floor of the specific force [m/s^2],
             bounds of commanded rates [rad/s] and accelerations [rad/s^2], 5 floats.

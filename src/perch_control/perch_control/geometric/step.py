@@ -36,7 +36,7 @@ def predicted(state, f, extra, duration, mass, J, forward):
     Args:
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
         f: rotor thrusts [N], 4 floats.
-        extra: what makes up for the known disturbance (see `geometric_step`); the disturbance itself is its negative.
+        extra: compensation of the known disturbance (see `geometric_step`); the disturbance itself is its negative.
         duration: [s].
         mass, J, forward: constants of the vehicle.
 
@@ -60,7 +60,7 @@ def predicted(state, f, extra, duration, mass, J, forward):
 
 @compiled
 def drag_compensation(q, v, drag, extra):
-    """`extra` with what makes up for the rotor drag `drag` (per mass, axes of B) [1/s] at a velocity in W added."""
+    """Return `extra` plus the compensation of the rotor drag `drag` (per mass, axes of B) [1/s] at a velocity in W."""
     b1, b2, b3 = axes_of(q)
     d = axpy(drag[0] * dot(b1, v), b1, axpy(drag[1] * dot(b2, v), b2, scale(drag[2] * dot(b3, v), b3)))
     return (extra[0] + d[0], extra[1] + d[1], extra[2] + d[2], extra[3], extra[4], extra[5])
@@ -68,13 +68,13 @@ def drag_compensation(q, v, drag, extra):
 
 @compiled
 def rotors_for(wrench, speed, vehicle, lead):
-    """Rotor commands that reach a wrench after the lead time, tilt before thrust before yaw.
+    """Rotor commands that reach a wrench after the lead time, with priority of tilt over thrust over yaw.
 
     Args:
         wrench: thrust [N] and moments [N m], 4 floats.
         speed: present rotor speeds [rad/s], 4 floats.
-        vehicle: constants as `packed_vehicle` gives them.
-        lead: [s].
+        vehicle: constants (see `packed_vehicle`).
+        lead: lead time [s].
 
     Returns:
         Commanded speeds [rad/s] and the thrusts that they reach [N], 4 floats each.
@@ -92,15 +92,15 @@ def rotors_for(wrench, speed, vehicle, lead):
 def control_step(state, reference, speed, command, extra, gains, limits, lead, lag, vehicle):
     """One control period. [M:eq2]
 
-    The state is predicted to the moment at which the rotors have what is wanted now, and the law is evaluated there.
+    The state is predicted to the time at which the rotors reach the present demand, and the law is evaluated there.
 
     Args:
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B now, 13 floats.
-        reference: at `lag` seconds from now, 33 floats; see `geometric_step`.
-        speed, command: rotor speeds now and what they are following [rad/s], 4 floats each.
+        reference: setpoint `lag` seconds from now, 33 floats; see `geometric_step`.
+        speed, command: present rotor speeds and their commands [rad/s], 4 floats each.
         extra, gains, limits: see `geometric_step`.
         lead: time in which the rotors would reach the wanted thrust if the command stayed [s].
-        lag: by which they follow it, where every period brings a new command [s] (`rotor_lag.lag_behind`).
+        lag: delay with which they follow it, with a new command in every period [s] (`rotor_lag.lag_behind`).
         vehicle: (mass, Jx, Jy, Jz), (thrust coefficient, lowest and highest speed, time constant), moment rows (3 x 4),
             mixing columns (4 x 4), rotor drag / mass (3).
 

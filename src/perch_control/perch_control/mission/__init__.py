@@ -1,4 +1,4 @@
-"""Missions: arm, take off, look, plan, fly, verify, recover. `perch_control.mission_component` brings them to their channels."""
+"""Missions: arm, take off, search, plan, fly, verify, recover. `perch_control.mission_component` connects them to channels."""
 
 from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.inspection import InspectionMission

@@ -1,4 +1,4 @@
-"""Does the vehicle stick? Told from the IMU and the estimated state alone."""
+"""Detection of adhesion, from the IMU and the estimated state alone."""
 
 from __future__ import annotations
 
@@ -26,21 +26,22 @@ class AdhesionMonitor:
 
     In flight the only large force is the thrust, along b3: at a perch attitude it cannot carry the weight, so that the
     mean specific force differs from `R_WB^T g e3` by the vehicle's acceleration (at 90 degrees: 9.8 m/s^2 of fall).
-    A vehicle that sticks is carried by the surface: the specific force is `R_WB^T g e3` whatever the motors do.
+    A vehicle that adheres is carried by the surface: the specific force is `R_WB^T g e3`, whatever the motors do.
 
-    A small tilt shows less: at theta from the vertical no thrust comes closer to the weight than g sin(theta) (g beyond 90
-    degrees), so that what counts as balanced is at most half of that, and a hover must not count as aligned.
+    At a small tilt the difference is smaller: at theta from the vertical, no thrust comes closer to the weight than g sin(theta)
+    (g beyond 90 degrees). So the threshold is half of that, between `_LEAST` and `UNBALANCED`, and the tolerance of the
+    alignment is at most half of the target's tilt (but `_LEAST_TILT` at least), so that a hover is not taken as aligned.
     """
 
     def __init__(self) -> None:
         self._samples: deque[np.ndarray] = deque(maxlen=_count(NOMINAL_PERIOD))
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Discard all samples."""
         self._samples.clear()
 
     def add(self, specific_force_B: np.ndarray, period: float = NOMINAL_PERIOD) -> None:
-        """Take IMU samples in, shape (n, 3) [m/s^2], that come with a period [s]."""
+        """Add IMU samples, shape (n, 3) [m/s^2], that have a period [s]."""
         count = _count(period)
         if count != self._samples.maxlen:
             self._samples = deque(self._samples, count)
@@ -48,24 +49,24 @@ class AdhesionMonitor:
 
     @property
     def filled(self) -> bool:
-        """The window is full."""
+        """Whether the window is full."""
         return len(self._samples) == self._samples.maxlen
 
     def imbalance(self, q_WB: np.ndarray) -> float:
-        """Size of the mean acceleration that the IMU implies at this attitude [m/s^2]."""
+        """Magnitude of the mean acceleration that the IMU implies at this attitude [m/s^2]."""
         g_B = so3.quat_rotate(so3.quat_conjugate(q_WB), np.array([0.0, 0.0, GRAVITY]))
         return float(np.linalg.norm(np.mean(self._samples, axis=0) - g_B))
 
     def fallen_off(self, state: State) -> bool:
-        """Nothing carries the vehicle, and it moves: with motors off, it has come off.
+        """Whether the vehicle has come off, with its motors off: the specific force is small, and the vehicle moves.
 
-        One that rocks in what holds it feels as little for a moment; but it does not gather speed.
+        While the vehicle swings in its attachment, the specific force may also be small for a moment; but the speed stays low.
         """
         return (self.filled and float(np.linalg.norm(np.mean(self._samples, axis=0))) < 0.4 * GRAVITY
                 and float(np.linalg.norm(state.v_WB)) > SPEED)
 
     def attached(self, state: State, target: Target) -> bool:
-        """The vehicle rests on the target: in place, aligned, slow, and carried by something other than its rotors."""
+        """Whether the vehicle rests on the target: in place, aligned, slow, and carried by something other than its rotors."""
         if not self.filled:
             return False
         b3, s3 = so3.quat_rotate(state.q_WB, _UP), so3.quat_rotate(target.q_WS, _UP)
@@ -77,12 +78,12 @@ class AdhesionMonitor:
 
     @staticmethod
     def tells(state: State) -> bool:
-        """Whether this attitude tells rest from flight: nothing hovers in it."""
+        """Whether rest and flight can be distinguished at this attitude, since no vehicle hovers in it."""
         return _unbalanced_in_flight(so3.quat_rotate(state.q_WB, _UP)) > 2.0 * _LEAST
 
 
 def _count(period: float) -> int:
-    """Samples in the window."""
+    """Number of samples in the window."""
     return max(3, round(WINDOW / period))
 
 

@@ -1,4 +1,4 @@
-"""Requests to planners that are under way, and the answers that belong to them."""
+"""Pending requests to planners, and the assignment of answers to them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Answer = PerchPlan | PowerlinePlan | Unavailable
 
 @dataclass
 class Asked:
-    """A request under way: when it was made and when its answer counts [ns], the plan's start [s], the answer."""
+    """A pending request: when it was made and from when its answer is used [ns], the plan's start [s], the answer."""
 
     made: int
     due: int
@@ -22,18 +22,18 @@ class Asked:
 
 
 class Requests:
-    """Those to one service, in the order in which they were made."""
+    """Pending requests to one service, in the order in which they were made."""
 
     def __init__(self) -> None:
         self._under_way: list[Asked] = []
 
     def add(self, asked: Asked) -> Asked:
-        """A request is made; those that nobody answers are forgotten."""
+        """Add a request; requests that have not been answered within `FORGOTTEN` are dropped."""
         self._under_way = [other for other in self._under_way if asked.made - other.made < FORGOTTEN] + [asked]
         return asked
 
     def answered(self, answer: Answer) -> None:
-        """An answer belongs to the request for its start; one without a trajectory to the oldest under way."""
+        """Assign an answer to the request for its start; one without a trajectory, or with another start, to the oldest one."""
         if not self._under_way:
             return
         start = None if isinstance(answer, Unavailable) or answer.trajectory is None else answer.trajectory.start_time

@@ -1,4 +1,4 @@
-"""Off the surface or the wire that carries the vehicle, to a hover from which the next goal flies."""
+"""Departure from the surface or wire that carries the vehicle, to a hover from which the next goal can start."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _THRUST = 0.5  # of each rotor, soon after its start [N]
 
 
 class Departure(MissionMachine):
-    """From a wire the planner's recovery [P:V-B], planned from the vehicle at rest; from a surface, or where there is no plan, the
-    controller's recovery along the surface's normal. Either starts the motors, which opens what holds the vehicle.
+    """Departure by a recovery: from a wire that of the planner [P:V-B], planned from the vehicle at rest; from a surface, or
+    without a plan, that of the controller, along the surface's normal. Either starts the motors, which releases the attachment.
     """
 
     _no_plan = False  # the planner has refused
@@ -28,7 +28,7 @@ class Departure(MissionMachine):
         self.phases = {Phase.ARMING: self._leaving, Phase.RECOVERING: self._recovering}
 
     def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
-        """There is none."""
+        """Do nothing: a departure has no target."""
 
     def _leaving(self, inputs: Inputs, outputs: Outputs) -> None:
         if inputs.plan is not None:
@@ -49,14 +49,14 @@ class Departure(MissionMachine):
             outputs.commands.append((Command.ARM, "departing"))
 
     def _way_out(self, inputs: Inputs, wire: Target) -> PlanQuery:
-        """From the vehicle as it hangs there."""
+        """Return the query for the recovery, from the vehicle at rest on the wire."""
         zero, x, latency = np.zeros(3), inputs.state, self.settings.powerline_latency
         start = inputs.time + self.settings.lead(latency)
         still = StateSample(p=x.p_WB, q=x.q_WB, v=zero, w=zero, a=zero, dw=zero, rotor_thrust=np.full(4, _THRUST))
         return PlanQuery(start, x.p_WB, zero, 0.0, wire, self._goal, latency, state=still, recovery=True)
 
     def _fly(self, inputs: Inputs, outputs: Outputs, plan: Plan | Refusal) -> None:
-        """At once."""
+        """Fly the plan at once; where it was refused, arm for the controller's own recovery."""
         if isinstance(plan, Refusal):
             self.message = f"no plan to leave the wire: {plan.message}"
             outputs.commands.append((Command.ARM, "departing"))

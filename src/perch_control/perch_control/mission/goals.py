@@ -1,4 +1,4 @@
-"""The Perch action's goal: whether it can be flown, and what it means."""
+"""Goals of the Perch action: their check, and their conversion to goals of the mission."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from perch_control.mission.values import Goal
 
 
 def problem_with(goal: PerchGoal, settings: MissionSettings) -> str:
-    """Why a goal cannot be flown; empty: it can."""
+    """Return why a goal cannot be flown; empty: it can."""
     if goal.mode not in MISSIONS:
         return f"mode {goal.mode} is none of {known_modes()}"
     problem = mission_class(goal.mode).problem(goal, settings)
@@ -31,7 +31,7 @@ def problem_with(goal: PerchGoal, settings: MissionSettings) -> str:
 
 
 def goal_of(goal: PerchGoal, settings: MissionSettings) -> Goal:
-    """The goal with its defaults filled in."""
+    """Return the mission's goal, with defaults filled in."""
 
     def given(value: float, default: float) -> float:
         return default if math.isnan(value) else value

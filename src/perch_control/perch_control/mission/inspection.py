@@ -13,7 +13,7 @@ from perch_control.mission.wire import LineMission
 
 
 class InspectionMission(LineMission):
-    """See the line, fly the waypoints, end in a hover."""
+    """Find the line, fly the waypoints, end in a hover."""
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         super().__init__(settings, ids, moves)
@@ -22,13 +22,13 @@ class InspectionMission(LineMission):
 
     @classmethod
     def problem(cls, goal: PerchGoal, settings: MissionSettings) -> str:
-        """Waypoints are needed as well."""
+        """As for all missions; in addition, at least two waypoints are required."""
         if len(settings.places) < 2:
             return f"inspection: the parameter mission.waypoints holds {len(settings.places)} waypoints, needs at least 2"
         return super().problem(goal, settings)
 
     def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
-        """From the present hover along the waypoints; the controller's line terms keep the line in view and all lines away."""
+        """Fly from the hover along the waypoints; the controller's line terms keep the line in view and avoid all lines."""
         places = [self._moves.hover, *self.settings.places]
         outputs.reference = waypoint_lines(places, self.settings.inspection_speed, inputs.time + LEAD)
         outputs.trajectory_id = self._flown_id = self._new_id()

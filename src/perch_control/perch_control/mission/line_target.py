@@ -1,4 +1,4 @@
-"""From a map of powerlines to the place to perch on."""
+"""Target of a perch, from a map of powerlines."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _REACH = 0.4  # a line that is farther from the goal's point is another one [m]
 
 
 def mapped_target(lines: PowerlineMap, goal: Goal, p_WB: np.ndarray) -> Target | None:
-    """The target on the mapped line that passes nearest to the goal's rough point.
+    """Return the target on the mapped line that passes nearest to the goal's approximate point.
 
     Args:
         lines: the map.
-        goal: says where on it, roughly, and with which tilt.
-        p_WB: where the vehicle looks from [m], shape (3,).
+        goal: gives the approximate point and the tilt.
+        p_WB: position of the vehicle [m], shape (3,).
 
     Returns:
-        The target, b2 along the line and b3 leaning towards the vehicle's side, with the nearest lines, as many as a plan takes; None where
-        no line passes near, or a vertical one.
+        The target, with b2 along the line and b3 leaning towards the vehicle's side, and with the nearest lines, as many as a
+        plan takes; None where no line passes near, or where the nearest one is vertical.
     """
     segments = [mapped.segment for mapped in lines.lines]
     near = [(float(line.distance(goal.perch_point)), k) for k, line in enumerate(segments)]

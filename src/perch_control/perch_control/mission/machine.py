@@ -1,4 +1,4 @@
-"""What all missions share: arm, take off, look, recover, end. What is done at the target is said by each kind."""
+"""Common part of all missions: arm, take off, search, recover, end. Subclasses define the action at the target."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
 class MissionMachine(ABC):
     """One goal, from arming to its outcome. [M:II, Fig. 2]
 
-    `tick` maps what is known to what shall be done. Every phase ends in another phase, in an outcome, or by its own
-    time limit, so that a goal always ends; a cancelled or failed goal ends in a hover, or on the ground.
+    `tick` maps inputs to outputs. Every phase ends in another phase, in an outcome, or by its own time limit, so that a goal
+    always ends; a cancelled or failed goal ends in a hover, or on the ground.
 
-    A kind of mission says what it looks for (`target`), where from (`pattern`, `legs`), and what it does where the target has been seen
-    and the vehicle rests (`at_target`); phases of its own are added to `phases`.
+    A subclass defines its target (`target`), the search for it (`pattern`, `legs`), and the action once the target has been seen
+    and the vehicle rests (`at_target`); it adds its own phases to `phases`.
 
     Attributes:
-        phase, message, time_to_contact: as the feedback tells them.
-        phases: what is done in each phase.
+        phase, message, time_to_contact: as in the feedback.
+        phases: handler of each phase.
     """
 
     _goal: Goal  # from `start` on
     unseen = "no target seen"
-    """Words for a target that is not seen."""
+    """Message while no target is seen."""
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         """
         Args:
             settings: times, speeds, limits.
-            ids: numbers of the trajectories to come; never the same twice for one controller.
-            moves: those of the goals before; None: this is the first one.
+            ids: ids of the following trajectories; never repeated for one controller.
+            moves: moves of the preceding goals; None: this is the first goal.
         """
         self.settings = settings
         self.phase = Phase.IDLE
@@ -63,53 +63,53 @@ class MissionMachine(ABC):
 
     @property
     def legs(self) -> int:
-        """Places of the pattern that are flown to before anything else."""
+        """Number of places of the pattern that are visited before a target is used."""
         return 0
 
     @classmethod
     def problem(cls, goal: PerchGoal, settings: MissionSettings) -> str:
-        """Why a goal cannot be flown, beyond what holds for all missions; empty: it can."""
+        """Return why a goal cannot be flown, beyond the checks for all missions; empty: it can."""
         return ""
 
     def target(self, pad: Target | None, lines: PowerlineMap | None, p_WB: np.ndarray) -> Target | None:
-        """What is looked for, out of what is known.
+        """Return the target of this mission from the available sightings.
 
         Args:
-            pad: as localised last.
+            pad: last localised pad.
             lines: the newest map.
-            p_WB: where the vehicle is [m], shape (3,).
+            p_WB: position of the vehicle [m], shape (3,).
         """
         return pad
 
     def pattern(self) -> list[Look]:
-        """Places around the search hover (forward, left, up [m], turn [rad]): a pad may be out of view, the vehicle turns and rises."""
+        """Places around the search hover (forward, left, up [m], turn [rad]), to find a pad that is out of view."""
         return [(np.array([0.0, 0.0, SEARCH_RISE]), 0.0), (np.zeros(3), SEARCH_TURN), (np.zeros(3), -SEARCH_TURN),
                 (np.array([0.0, 0.0, -SEARCH_RISE]), 0.0), (np.zeros(3), 0.0)]
 
     def reach(self, offset: np.ndarray, p: np.ndarray, target: Target | None) -> np.ndarray:
-        """How much of an offset of the pattern (forward, left, up [m]) from the search place `p` [m] is flown."""
+        """Return the part of an offset of the pattern (forward, left, up [m]) from the search place `p` [m] that is flown."""
         return offset
 
     @abstractmethod
     def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
-        """The target has been seen for long enough, and the vehicle rests: what is done now."""
+        """Act once the target has been seen for long enough and the vehicle rests."""
 
     def committed(self, time: float) -> str:
-        """Why what is flown can no longer be left at a time [s]; empty: it can."""
+        """Return why the running plan can no longer be left at a time [s]; empty: it can."""
         return ""
 
     def holds(self, inputs: Inputs) -> bool:
-        """In a recovery: the vehicle is held after all."""
+        """Whether the target holds the vehicle after all, during a recovery."""
         return False
 
     # -- interface ---------------------------------------------------------------------------------------------------
 
     def reconfigure(self, settings: MissionSettings) -> None:
-        """New settings count from the next tick on; the moves under way stay."""
+        """Apply new settings from the next tick on; the moves of the running goal keep theirs."""
         self.settings = settings
 
     def start(self, goal: Goal, time: float) -> None:
-        """Take a goal; the machine must be idle."""
+        """Start a goal; the machine must be idle."""
         self._goal, self._attempts_left = goal, goal.attempts
         self._failure: str | None = None
         self._moves.settings = self.settings
@@ -151,7 +151,7 @@ class MissionMachine(ABC):
             self.message = "arming"
 
     def _time_to_ask(self, inputs: Inputs) -> bool:
-        """Whether to ask the controller to arm, now or again: a command can be lost, or refused since the odometry is a moment late."""
+        """Whether to send the command to arm, for the first time or again: it may be lost, or refused while odometry is late."""
         if self._asked_at is not None and inputs.time - self._asked_at < self.settings.ask_again:
             return False
         self._asked_at = inputs.time
@@ -209,7 +209,7 @@ class MissionMachine(ABC):
             self._recovered(inputs, outputs)
 
     def _recovered(self, inputs: Inputs, outputs: Outputs) -> None:
-        """The recovery has ended in a hover."""
+        """End the goal or start another attempt, after a recovery has ended in a hover."""
         self._attempts_left -= 1
         if self._cancelled:
             self._end(outputs, Result.CANCELLED, "cancelled; hovering")
@@ -219,7 +219,7 @@ class MissionMachine(ABC):
             self._end(outputs, Result.MISSED, f"{self._failure}; recovered to a hover")
 
     def _go_to_search(self, inputs: Inputs, outputs: Outputs, message: str, on_ground: bool = False) -> None:
-        """From where the vehicle stands or hovers to the search place."""
+        """Fly from the ground or from the present hover to the search place."""
         self._moves.begin(self._goal, inputs.state, on_ground)
         self._enter(Phase.TAKE_OFF, inputs.time, message)
         self._go(inputs, outputs, self._moves.search)
@@ -228,7 +228,7 @@ class MissionMachine(ABC):
         outputs.reference, outputs.trajectory_id = self._moves.go(inputs.time, place), self._new_id()
 
     def _usable_now(self, inputs: Inputs) -> tuple[Target | None, str]:
-        """The target, where it is fresh and certain enough to plan on; otherwise None, and why."""
+        """Return the target where it is recent and certain enough to plan on; otherwise None, and the reason."""
         if inputs.target is None or inputs.target.time < self._entered_search:
             return None, self.unseen
         why = unusable(inputs.target, self._goal, self.settings)
@@ -237,7 +237,7 @@ class MissionMachine(ABC):
     # -- endings -----------------------------------------------------------------------------------------------------
 
     def _lost(self, inputs: Inputs, outputs: Outputs) -> bool:
-        """The controller fell back to recovery or descent while the mission was waiting in flight."""
+        """Whether the phase was left, as the controller recovers or descends, or as the take-off takes too long."""
         if inputs.controller is ControllerState.RECOVERING:
             self._gave_up(inputs, f"controller recovers: {inputs.controller_message}")
             return True
@@ -250,21 +250,21 @@ class MissionMachine(ABC):
         return False
 
     def _descends(self, inputs: Inputs, outputs: Outputs) -> bool:
-        """The controller lands, or has landed: the goal ends, and nothing undoes the landing."""
+        """End the goal where the controller lands or has landed; returns whether it does. The landing is not reversed."""
         if inputs.controller not in (ControllerState.LANDING, ControllerState.DISARMED):
             return False
         self._end(outputs, Result.TRACKING_LOST, f"controller descends: {inputs.controller_message}")
         return True
 
     def _astray(self, inputs: Inputs) -> bool:
-        """The controller hovers, but not where it was sent: it has recovered on the way."""
+        """Recover where the controller hovers elsewhere than commanded, as it has left the move; returns whether it does."""
         if inputs.controller is not ControllerState.HOVERING or not self._moves.astray(inputs.time, inputs.state):
             return False
         self._gave_up(inputs, f"the controller gave up the way to the search place: {inputs.controller_message}")
         return True
 
     def _gave_up(self, inputs: Inputs, why: str) -> None:
-        """The controller has left the way to the target, or was told to: recover, without a further attempt."""
+        """Recover without a further attempt, as the controller has left the way to the target or was commanded to."""
         self._attempts_left = 1
         self._missed(inputs, why)
 

@@ -1,4 +1,4 @@
-"""The missions that a goal can ask for: its mode -> class. A mission of your own is one more line."""
+"""Registry of the missions: mode of the goal -> class. Another mission takes one more line."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ MISSIONS: dict[int, str] = {
 
 
 def mission_class(mode: int) -> type[MissionMachine]:
-    """The class of a mission.
+    """Return the class of a mission.
 
     Raises:
-        KeyError: there is none for this mode.
+        KeyError: there is no mission for this mode.
     """
     return resolved(MISSIONS[mode])
 
 
 def known_modes() -> str:
-    """The modes in words."""
+    """Return the registered modes as text."""
     return ", ".join(f"{Mode(mode).name} ({mode})" if mode in tuple(Mode) else str(int(mode)) for mode in MISSIONS)

@@ -24,19 +24,19 @@ Reach = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def place_of(state: State) -> Place:
-    """Where the vehicle is, as a hover."""
+    """Return the position and yaw of the vehicle as a hover."""
     return np.array(state.p_WB), float(so3.yaw_of(so3.quat_to_matrix(state.q_WB)))
 
 
 class Moves:
-    """Where the vehicle took off, where the last move ends, and whether it has got there: kept from goal to goal.
+    """Take-off place, end of the last move, and whether it has been reached; kept from goal to goal.
 
     Attributes:
         settings: speeds and times.
-        home: where the vehicle stood when it was armed last; below where it hovered at the first goal, if nobody saw that.
-        search: the goal's search pose, or above the place where the vehicle took off.
-        hover: where the last move ends, or the vehicle was when there was none.
-        wire: the place on a wire that was perched on last, None: a surface.
+        home: place where the vehicle was last armed on the ground; if unknown, below its hover at the first goal.
+        search: the goal's search pose, or the place above `home`.
+        hover: end of the last move, or the vehicle's place at the start of the goal.
+        wire: target of the last perch on a wire; None: the last perch was on a surface.
     """
 
     def __init__(self, settings: MissionSettings) -> None:
@@ -50,7 +50,7 @@ class Moves:
         self.looked = 0                   # places of the search pattern that were flown to
 
     def begin(self, goal: Goal, state: State, on_ground: bool) -> None:
-        """Go on from the vehicle's state: armed on the ground, or in the air."""
+        """Start the moves of a goal from the vehicle's state: armed on the ground, or in the air."""
         p, yaw = self.hover = place_of(state)
         height = np.array([0.0, 0.0, goal.takeoff_height])
         if on_ground:
@@ -76,7 +76,7 @@ class Moves:
         return p + so3.exp(np.array([0.0, 0.0, yaw])) @ reach(offset, p), yaw + turn
 
     def go(self, time: float, place: Place) -> FlatTrajectory:
-        """A move from the present hover to another, at rest at both ends."""
+        """Return a move from the present hover to another, at rest at both ends."""
         (p0, yaw0), (p, yaw) = self.hover, place
         turn = math.remainder(yaw - yaw0, 2 * math.pi)
         duration = max(1.0, float(np.linalg.norm(p - p0)) / self.settings.transit_speed, abs(turn) / TURN_RATE)
@@ -85,21 +85,21 @@ class Moves:
         return rest_to_rest(p0, p, yaw0, yaw0 + turn, duration, start_time=time + LEAD)
 
     def arrived(self, time: float, state: State) -> bool:
-        """The last move has ended a while ago and the vehicle rests."""
+        """Whether the last move has ended at least `settle_time` ago and the vehicle rests."""
         return self._over(time) and self.slow(state)
 
     def astray(self, time: float, state: State) -> bool:
-        """The last move has ended a while ago, and the vehicle is elsewhere: a plan from the hover would begin too far away."""
+        """Whether the last move has ended with the vehicle elsewhere: a plan from the hover would begin too far away."""
         return self._over(time) and float(np.linalg.norm(state.p_WB - self.hover[0])) > START_GAP
 
     def _over(self, time: float) -> bool:
-        """The last move has ended a while ago."""
+        """Whether the last move has ended at least `settle_time` ago."""
         return time > self.began + self.length + self.settings.settle_time
 
     def dwelt(self, time: float) -> bool:
-        """The vehicle has looked around from here for long enough."""
+        """Whether the vehicle has observed from this place for `search_dwell`."""
         return time - self.began > self.length + self.settings.search_dwell
 
     def slow(self, state: State) -> bool:
-        """The vehicle hardly moves."""
+        """Whether the vehicle is slower than `settle_speed`."""
         return float(np.linalg.norm(state.v_WB)) < self.settings.settle_speed

@@ -19,7 +19,7 @@ _FLYING_ON = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerStat
 
 
 class InFlight(Protocol):
-    """A plan that is flown, and the place that it was made for."""
+    """A plan in flight, and the target that it was made for."""
 
     @property
     def plan(self) -> Plan: ...
@@ -32,7 +32,7 @@ R = TypeVar("R", bound=InFlight)
 
 
 class PerchingMission(MissionMachine, Generic[R]):
-    """What perches on surfaces and on wires share. R: what is known of the plan in flight."""
+    """Common part of perches on surfaces and on wires. R: type of the plan in flight."""
 
     _target: Target      # from the query on
     _running: R          # from the first trajectory on
@@ -51,32 +51,32 @@ class PerchingMission(MissionMachine, Generic[R]):
     @property
     @abstractmethod
     def latency(self) -> float:
-        """From the request of a plan from a hover to its use [s]."""
+        """Time from the request of a plan from a hover to its use [s]."""
 
     @abstractmethod
     def running(self, plan: Plan, target: Target) -> R:
-        """A plan in flight."""
+        """Return a plan and its target as a plan in flight."""
 
     @abstractmethod
     def better(self, inputs: Inputs, outputs: Outputs) -> None:
-        """On the way: follow the target as it is seen better, and ask for what may be needed."""
+        """Update the running plan as the target estimate improves, and request new plans and ways out."""
 
     def waiting(self, inputs: Inputs, outputs: Outputs) -> bool:
-        """Near the contact: whether it is still awaited."""
+        """Whether the contact is still awaited."""
         return inputs.time <= self._running.plan.end + self.settings.contact_time + 0.2
 
     def not_held(self, outputs: Outputs) -> None:
-        """No contact was felt: what is done about it."""
+        """Act on a contact that was not detected."""
 
     def holds(self, inputs: Inputs) -> bool:
-        """A contact came late, or an abort did: what was given up holds the vehicle all the same."""
+        """Whether an abandoned perch holds the vehicle after all, as the contact or the abort was late."""
         return (self._flown_id > 0 and -self.settings.contact_early < inputs.time - self._running.plan.end < 1.0
                 and self._adhesion.tells(inputs.state) and self._adhesion.attached(inputs.state, self._running.target))
 
     # -- phases ------------------------------------------------------------------------------------------------------
 
     def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
-        """Ask for a plan from the hover."""
+        """Request a plan from the hover."""
         self._target = target
         p, yaw = self._moves.hover
         start = inputs.time + self.settings.lead(self.latency)
@@ -150,7 +150,7 @@ class PerchingMission(MissionMachine, Generic[R]):
             outputs.commands.append((Command.ATTACHED, "told again"))  # the first message was lost
 
     def _motors_on(self, outputs: Outputs) -> None:
-        """Nothing carries the vehicle any more."""
+        """Start the motors and hover: the vehicle has come off."""
         outputs.commands += [(Command.ARM, "came off the surface"), (Command.HOVER, "came off the surface")]
 
     def _recovering(self, inputs: Inputs, outputs: Outputs) -> None:

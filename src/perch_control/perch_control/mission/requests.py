@@ -1,4 +1,4 @@
-"""The mission's queries as requests to the planners, their answers as the mission takes them, and plans as orders."""
+"""Conversions: the mission's queries to planner requests, planner answers to plans, and plans to orders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from perch_control.mission.values import Plan, PlanQuery, Refusal
 
 
 def perch_request(query: PlanQuery, thrust_ratio: float) -> PerchPlanRequest:
-    """The request for a perch on a surface; `thrust_ratio`: as the controller tells it."""
+    """Return the request for a perch on a surface; `thrust_ratio`: as reported by the controller."""
     return PerchPlanRequest(
         start=nanoseconds(query.start_time), p=query.p, v=query.v, yaw=float(query.yaw), current=query.current,
         p_WS=query.target.p_WS, q_WS=query.target.q_WS, segment_times=() if query.duration is None else (float(query.duration),),
@@ -21,7 +21,7 @@ def perch_request(query: PlanQuery, thrust_ratio: float) -> PerchPlanRequest:
 
 
 def powerline_request(query: PlanQuery) -> PowerlinePlanRequest:
-    """The request for a perch on a cable, or for the way out of one."""
+    """Return the request for a perch on a powerline, or for the way out of one."""
     x, target = query.state, query.target
     request = PowerlinePlanRequest(
         start=nanoseconds(query.start_time), p=query.p, q=so3.quat_exp(np.array([0.0, 0.0, query.yaw])), v=query.v,
@@ -32,7 +32,7 @@ def powerline_request(query: PlanQuery) -> PowerlinePlanRequest:
 
 
 def plan_answer(plan: PerchPlan | PowerlinePlan | Unavailable) -> Plan | Refusal:
-    """What a planner's answer means to the mission."""
+    """Return a planner's answer as a plan or a refusal."""
     if isinstance(plan, Unavailable):
         return Refusal(plan.reason)
     if not plan.success or plan.trajectory is None:
@@ -46,5 +46,5 @@ def plan_answer(plan: PerchPlan | PowerlinePlan | Unavailable) -> Plan | Refusal
 
 
 def flown_order(id: int, plan: Plan, contact_time: float) -> TrajectoryOrder:
-    """A plan as it is ordered; `contact_time`: how long the contact is awaited [s]."""
+    """Return a plan as an order; `contact_time`: how long the contact is awaited [s]."""
     return TrajectoryOrder.of(id, plan.trajectory, plan.at_end, contact_time, plan.recovery_start)

@@ -1,5 +1,5 @@
-"""What the mission asks while a perch on a surface is flown: the same perch to the target as it is seen nearer (M's future work), and
-ways out of it."""
+"""Planner requests during a perch on a surface: the same perch to the target as seen from closer (M's future work), and ways out
+of it."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class RunningPerch:
     """A surface plan in flight.
 
     Attributes:
-        plan: what is flown.
-        target: the place that it was made for.
+        plan: the plan being flown.
+        target: the target that it was made for.
         asked: target of the newest query.
         asked_at: time of the newest query [s].
-        ways_out: those that are known.
+        ways_out: ways out of the plan.
     """
 
     plan: Plan
@@ -35,18 +35,18 @@ class RunningPerch:
 
     @classmethod
     def begun(cls, plan: Plan, target: Target, settings: MissionSettings) -> RunningPerch:
-        """A planner's answer in flight. From `contact_early` before the contact on, it may come: there is no way out any more."""
+        """Return a planner's answer as a plan in flight; there is no way out within `contact_early` before the contact."""
         return cls(plan, target, target, WaysOut(plan.start_time - _SPACING, plan.end - settings.contact_early, _SPACING))
 
     def way_out(self, time: float, goal: Goal, settings: MissionSettings) -> PlanQuery | None:
-        """The query for the next way out at a tick [s]; None: there is nothing to ask for."""
+        """Return the query for the next way out at the time of a tick [s]; None: no further one is needed."""
         start, zero = self.ways_out.next(time + settings.planner_latency + DECISION), np.zeros(3)
         if start is None:
             return None
         return PlanQuery(start, zero, zero, 0.0, self.target, goal, settings.planner_latency, current=self.plan.trajectory, recovery=True)
 
     def better(self, answer: Plan | Refusal | None, time: float, settings: MissionSettings) -> RunningPerch | None:
-        """The plan to fly instead of this one, from the answer to the newest query; None: this one."""
+        """Return the plan to fly, from the answer to the newest query: a new one, or this one if that is a detour; None: none."""
         if not isinstance(answer, Plan) or answer.start_time <= time:
             return None
         if abs(answer.end - self.plan.end) > settings.replan_shift:
@@ -55,15 +55,15 @@ class RunningPerch:
 
     def query(self, time: float, target: Target | None, goal: Goal, settings: MissionSettings,
               start: float, latency: float) -> tuple[RunningPerch, PlanQuery] | None:
-        """What to ask now, and the plan in flight that remembers it; None: nothing.
+        """Return the plan in flight with the next query recorded, and the query; None: there is nothing to request.
 
         Args:
-            time: of the tick [s].
-            target: as seen now, when it is certain enough to plan on.
-            goal: what was asked of the mission.
-            settings: when plans are asked for.
-            start: when a new plan could start [s].
-            latency: from the request to the use of a plan [s].
+            time: time of the tick [s].
+            target: present target, if certain enough to plan on.
+            goal: goal of the mission.
+            settings: period and limits of the requests.
+            start: earliest start of a new plan [s].
+            latency: time from the request to the use of a plan [s].
         """
         if target is None or target.time <= self.asked.time or self.plan.end - start <= settings.replan_until:
             return None

@@ -1,11 +1,11 @@
-"""What the mission asks while a powerline plan is flown: a better perch, and ways out of it. [P:V-B]
+"""Planner requests during a powerline plan: a better perch, and ways out of it. [P:V-B]
 
-A plan rests on a map that was made from metres away, by an odometry that has drifted since. On the way the wire comes near,
-and the map gets better: the plan as it is moves with the wire, as long as the wire is seen. A wire that turns out to be
-somewhere else gets a new plan from the running one's own state, so that nothing jumps.
-Between these, recoveries are planned from states that lie ahead, one after the other: an abort at any time finds one ready.
-The last of them leaves the wire itself, from where the vehicle then is beside the newest map: one that missed the wire is not
-where the plan's own recovery begins.
+A plan is based on a map that was made from metres away, with an odometry that has drifted since. As the vehicle comes closer,
+the map improves: the plan is shifted with the wire as long as the wire is seen. Where the wire turns out to be elsewhere, a new
+plan is made from the running one's own state, so that the reference does not jump.
+In between, recoveries are planned from future states, one after the other, so that one is ready for an abort at any time.
+The last of them leaves the wire itself, from the vehicle's expected position relative to the newest map: a vehicle that has
+missed the wire is not where the plan's own recovery begins.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class RunningPlan:
     """A powerline plan in flight, with at most one query under way.
 
     Attributes:
-        plan: what is flown.
-        target: the place that it was made for.
-        states: of the plan, with unit quaternions.
-        ways_out: those that are known; nearer to the contact the plan's own recovery is the way out.
+        plan: the plan being flown.
+        target: the target that it was made for.
+        states: states of the plan, with unit quaternions.
+        ways_out: ways out of the plan; closer to the contact, the plan's own recovery is the way out.
     """
 
     def __init__(self, plan: Plan, target: Target, settings: MissionSettings, states: SampledTrajectory, replanned_at: float = -math.inf) -> None:
@@ -46,10 +46,10 @@ class RunningPlan:
 
     @classmethod
     def begun(cls, plan: Plan, target: Target, settings: MissionSettings, replanned_at: float = -math.inf) -> RunningPlan:
-        """A planner's answer in flight.
+        """Return a planner's answer as a plan in flight.
 
         Raises:
-            TypeError: it carries no states.
+            TypeError: the plan carries no states.
         """
         if isinstance(plan.trajectory, FlatTrajectory):
             raise TypeError("a powerline plan carries states, not polynomials")
@@ -60,13 +60,13 @@ class RunningPlan:
         return self.states.sample(time - self.plan.start_time)
 
     def query(self, time: float, present: State, target: Target | None, goal: Goal) -> PlanQuery | None:
-        """What to ask now, if anything.
+        """Return the next query; None: there is nothing to request.
 
         Args:
-            time: of the tick [s].
+            time: time of the tick [s].
             present: estimated state of the vehicle.
-            target: as mapped now, when it is certain enough to plan on.
-            goal: what was asked of the mission.
+            target: target by the present map, if certain enough to plan on.
+            goal: goal of the mission.
         """
         if self._asked is not None:
             return None
@@ -103,16 +103,16 @@ class RunningPlan:
         return None, RunningPlan.begun(plan, query.target, self._settings, self._replanned_at)
 
     def moved(self, time: float, target: Target | None, goal: Goal) -> RunningPlan | None:
-        """The same plan, moved with the wire; None: it stays where it is.
+        """Return the same plan, shifted with the wire; None: it is not shifted.
 
-        What counts at the wire is the place relative to it. The odometry has drifted since the map was made, but wire and
-        vehicle are seen in the same frame: where the wire is now, the perch is now. For centimetres a new plan would be worse:
-        the optimum of the rest is not the rest of the optimum, as N intervals share what time is left.
+        At the wire, only the position relative to it matters. The odometry has drifted since the map was made, but wire and
+        vehicle are estimated in the same frame, so the perch is shifted with the wire. For centimetres a new plan would be worse:
+        the optimum of the remainder is not the remainder of the optimum, as N intervals share the remaining time.
 
         Args:
-            time: of the tick [s].
-            target: as mapped now, when it is certain enough to plan on.
-            goal: what was asked of the mission.
+            time: time of the tick [s].
+            target: target by the present map, if certain enough to plan on.
+            goal: goal of the mission.
         """
         s = self._settings
         if not goal.replan or target is None or not self._seen_better(target):
@@ -139,12 +139,12 @@ class RunningPlan:
                 and float(np.linalg.norm(target.p_WS - self.target.p_WS)) > s.shift_max)
 
     def _perch_pose(self, target: Target) -> tuple[np.ndarray, np.ndarray]:
-        """The planned end, moved with the wire: position [m] and attitude xyzw. Its side of the wire stays the same."""
+        """The planned end, shifted with the wire: position [m] and attitude xyzw. It stays on the same side of the wire."""
         end = self.state(self.plan.end)
         return end.p + target.p_WS - self.target.p_WS, end.q
 
     def _continued(self, time: float, present: State, later: float) -> StateSample:
-        """The vehicle's state at a later time [s]: the plan's, and beside it by as much as at present."""
+        """Expected state of the vehicle at a later time [s]: that of the plan, with the present deviation from the plan."""
         now, then = self.state(time), self.state(later)
         turned = so3.quat_multiply(present.q_WB, so3.quat_conjugate(now.q))
         return dataclasses.replace(then, p=then.p + present.p_WB - now.p, v=then.v + present.v_WB - now.v, q=so3.quat_multiply(turned, then.q))

@@ -59,5 +59,5 @@ class MissionSettings:
         return [(np.array(self.waypoints[k:k + 3]), math.radians(self.waypoints[k + 3])) for k in range(0, len(self.waypoints), 4)]
 
     def lead(self, latency: float) -> float:
-        """From the request of a plan to its start, where it is used `latency` after the request [s]."""
+        """Time from the request of a plan to its start, where the plan is used `latency` after the request [s]."""
         return max(self.plan_lead, latency + 0.04)

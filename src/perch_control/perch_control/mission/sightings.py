@@ -1,4 +1,4 @@
-"""Where to perch, as the perception nodes tell: the pad and the map of powerlines."""
+"""Newest outputs of the perception nodes: the pad and the map of powerlines."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ AHEAD = NANOSECONDS // 10  # a stamp is no more than this ahead of the newest sa
 
 
 class Sightings:
-    """The newest of each.
+    """Owns the newest pose of the pad and the newest map.
 
     Attributes:
         lines: the map of powerlines.
@@ -24,7 +24,7 @@ class Sightings:
         self.lines: PowerlineMap | None = None
 
     def take_pad(self, pose: TargetPose, x: OdometryState | None, newest: int) -> str:
-        """Keep a pose of the pad, or tell why not.
+        """Keep a pose of the pad, or return why it is refused.
 
         Args:
             pose: of the pad.
@@ -41,7 +41,7 @@ class Sightings:
         return ""
 
     def pad(self, x: OdometryState) -> Target | None:
-        """The pad as it stands to the vehicle: what the odometry has drifted since it was seen makes it less certain."""
+        """Return the pad, with the uncertainty relative to the vehicle: the drift of the odometry since the sighting is added."""
         if self._pad is None:
             return None
         pose, before = self._pad
@@ -50,7 +50,7 @@ class Sightings:
                       largest_sigma(covariance[3:, 3:]))
 
     def take_lines(self, lines: PowerlineMap, newest: int | None) -> str:
-        """Keep a map, or tell why not; `newest` as in `take_pad`, None before any."""
+        """Keep a map, or return why it is refused; `newest` as in `take_pad`, None before the first stamp."""
         if newest is None or lines.stamp > newest + AHEAD:
             return "its stamp is in the future"
         if self.lines is not None and lines.stamp < self.lines.stamp:

@@ -9,7 +9,7 @@ from perch_control.mission.ways_out import WaysOut
 
 
 class SurfaceMission(PerchingMission[RunningPerch]):
-    """Find the pad, plan, perch; where asked, plan again to the pad as it is seen nearer. Ways out of the plan are kept ready."""
+    """Find the pad, plan, perch; re-plan to the pad as seen from closer, if requested. Ways out of the plan are kept ready."""
 
     unseen = "no tags seen"
     _asked_way_out: tuple[PlanQuery, WaysOut] | None = None
@@ -17,16 +17,16 @@ class SurfaceMission(PerchingMission[RunningPerch]):
 
     @property
     def latency(self) -> float:
-        """Of a plan for a surface, from a hover or in flight [s]."""
+        """Latency of a plan for a surface, from a hover or in flight [s]."""
         return self.settings.planner_latency
 
     def running(self, plan: Plan, target: Target) -> RunningPerch:
-        """A plan in flight. What was asked in an attempt before no longer counts."""
+        """Return a plan in flight; queries of an earlier attempt are discarded."""
         self._asked_way_out, self._asked_again = None, False
         return RunningPerch.begun(plan, target, self.settings)
 
     def better(self, inputs: Inputs, outputs: Outputs) -> None:
-        """Follow the target as it is seen nearer, and keep ways out ready."""
+        """Re-plan to the target as seen from closer, and keep ways out ready."""
         if inputs.way_out is not None and self._asked_way_out is not None:
             (query, ways), self._asked_way_out = self._asked_way_out, None
             if isinstance(inputs.way_out, Refusal):
@@ -41,7 +41,7 @@ class SurfaceMission(PerchingMission[RunningPerch]):
             self._asked_way_out, outputs.way_out_query = (asked, self._running.ways_out), asked
 
     def _plan_again(self, inputs: Inputs, outputs: Outputs) -> None:
-        """Continue from the running plan's future to the target as it is seen now (M's future work)."""
+        """Re-plan from a future state of the running plan to the target as seen at present (M's future work)."""
         if inputs.plan is not None:
             self._asked_again = False
         better = self._running.better(inputs.plan, inputs.time, self.settings)
@@ -58,9 +58,9 @@ class SurfaceMission(PerchingMission[RunningPerch]):
             (self._running, outputs.query), self._asked_again = asked, True
 
     def not_held(self, outputs: Outputs) -> None:
-        """Stop: the trajectory has no way on."""
+        """Command a hover: the trajectory ends at the contact."""
         outputs.commands.append((Command.HOVER, "no adhesion"))
 
     def committed(self, time: float) -> str:
-        """Ways out end shortly before the contact, or where the planner finds none."""
+        """As in the base class; ways out end shortly before the contact, or where the planner finds none."""
         return self._running.ways_out.committed(time) if self.phase in (Phase.TRACKING, Phase.VERIFYING) else ""

@@ -1,4 +1,4 @@
-"""Whether a target is good enough to plan on."""
+"""Check whether a target is good enough to plan on."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def unusable(target: Target, goal: Goal, settings: MissionSettings) -> str:
-    """Why a target is not certain enough to plan on; empty: it is.
+    """Return why a target is too uncertain to plan on, or not the one of the goal; empty: it is usable.
 
     Args:
         target: as localised.
-        goal: what was asked for.
+        goal: goal of the mission.
         settings: limits.
     """
     if target.position_sigma > settings.target_position_sigma:

@@ -1,4 +1,4 @@
-"""What goes into the mission at a tick and what comes out of it."""
+"""Inputs and outputs of the mission at a tick, and the values that they hold."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TICK = 0.02  # the mission decides so often [s]
 
 
 class Phase(str, Enum):
-    """Phases as the action's feedback names them."""
+    """Phases, named as in the action's feedback."""
 
     IDLE = "idle"
     ARMING = "arming"
@@ -31,7 +31,7 @@ class Phase(str, Enum):
 
     @property
     def progress(self) -> float:
-        """Share of the mission that lies behind, 0 to 1."""
+        """Completed fraction of the mission, 0 to 1."""
         order = (Phase.ARMING, Phase.TAKE_OFF, Phase.SEARCHING, Phase.PLANNING, Phase.TRACKING, Phase.VERIFYING, Phase.PERCHED)
         phase = Phase.TRACKING if self is Phase.INSPECTING else self
         return order.index(phase) / (len(order) - 1) if phase in order else 0.0
@@ -53,7 +53,7 @@ class Result(IntEnum):
 
 
 class Mode(IntEnum):
-    """Missions that come with perch_control: MODE_* of the Perch action. See `perch_control.mission.missions`."""
+    """Missions provided by perch_control: MODE_* of the Perch action. See `perch_control.mission.missions`."""
 
     SURFACE = 0
     POWERLINE = 1
@@ -79,7 +79,7 @@ class State:
 
 @dataclass(frozen=True)
 class Target:
-    """The place to perch on, as localised: the pad, or the point of a cable with b3 as the perch wants it.
+    """The place to perch on, as localised: the pad, or a point on a powerline with the b3 of the perch.
 
     Attributes:
         time: stamp of the image [s].
@@ -87,7 +87,7 @@ class Target:
         q_WS: attitude xyzw, shape (4,).
         position_sigma: largest 1-sigma of the position relative to the vehicle [m].
         attitude_sigma: the same of the attitude [rad].
-        lines: the map of powerlines that the target belongs to; none for a pad.
+        lines: mapped powerlines nearest to the target, including its own; empty for a pad.
         line: id of the target's line in that map.
     """
 
@@ -102,7 +102,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Goal:
-    """What is asked for: the Perch action's goal with its defaults filled in."""
+    """Goal of the mission: that of the Perch action, with its defaults filled in."""
 
     takeoff_height: float
     search_timeout: float
@@ -122,16 +122,16 @@ class PlanQuery:
 
     Attributes:
         start_time: when the trajectory shall start [s].
-        p, v: start position [m] and velocity [m/s] in W, shapes (3,); from there without acceleration.
+        p, v: start position [m] and velocity [m/s] in W, shapes (3,); the acceleration there is zero.
         yaw: start yaw [rad].
         target: where to perch.
-        goal: what was asked for.
-        latency: from the request to the use of the plan [s].
+        goal: goal of the mission.
+        latency: time from the request to the use of the plan [s].
         current: the trajectory being flown, to be continued from `start_time`; None: start from p, v.
         duration: time from the start to contact [s] that the new plan should keep; None: chosen by the planner.
         state: full state at the start, of a powerline plan that is being flown; None: level, with this yaw.
-        recovery: plan the way out alone, from `state`, or from `current` at `start_time`.
-        perch_pose: where to end (position [m], attitude xyzw); None: as the target and the goal's pitch say.
+        recovery: plan only the way out, from `state`, or from `current` at `start_time`.
+        perch_pose: end pose (position [m], attitude xyzw); None: it follows from the target and the goal's pitch.
     """
 
     start_time: float
@@ -150,11 +150,11 @@ class PlanQuery:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the planner has found.
+    """A plan of the planner.
 
     Attributes:
-        trajectory: what is flown.
-        duration: from its start to the contact [s].
+        trajectory: the trajectory to fly.
+        duration: time from its start to the contact [s].
         at_end, recovery_start: as in `TrajectoryOrder`.
     """
 
@@ -165,7 +165,7 @@ class Plan:
 
     @property
     def start_time(self) -> float:
-        """When it starts [s]."""
+        """Start of the trajectory [s]."""
         return self.trajectory.start_time
 
     @property
@@ -174,20 +174,20 @@ class Plan:
         return self.start_time + self.duration
 
     def starting(self, time: float) -> Plan:
-        """The same from another time on [s]: a vehicle at rest may begin at any time."""
+        """Return the plan with another start time [s]; a vehicle at rest may begin at any time."""
         return replace(self, trajectory=replace(self.trajectory, start_time=time))
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """There is no plan, in the planner's words."""
+    """Refusal of a plan, with the planner's message."""
 
     message: str
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Everything that the mission knows at a tick."""
+    """Inputs of the mission at a tick."""
 
     time: float
     state: State
@@ -214,7 +214,7 @@ class Outcome:
 
 @dataclass
 class Outputs:
-    """What the mission wants done after a tick."""
+    """Outputs of the mission after a tick."""
 
     commands: list[tuple[Command, str]] = field(default_factory=list)
     reference: FlatTrajectory | None = None    # a trajectory of the mission's own: take-off, search

@@ -16,7 +16,7 @@ _SHORTEST = 1.0  # duration of the shortest leg [s]
 def waypoint_lines(places: Sequence[Place], speed: float, start_time: float = 0.0) -> FlatTrajectory:
     """Straight lines from place to place, at rest at each, turning the shorter way.
 
-    The lines know nothing of what stands in their way: that is the matter of the controller's line terms.
+    Obstacles are not considered here; powerlines are avoided by the controller's line terms.
 
     Args:
         places: positions in W [m], shape (3,), and yaws [rad]; at least two.

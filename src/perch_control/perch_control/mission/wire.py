@@ -17,16 +17,16 @@ MAPPING_LEGS = 3     # moves of the pattern before a plan: up, nearer, down; per
 
 
 class LineMission(MissionMachine):
-    """What is done at a mapped powerline: the lines are looked at from several places first."""
+    """Mission at a mapped powerline: the lines are observed from several places."""
 
     unseen = "no line mapped near the goal's point, or a vertical one"
 
     def target(self, pad: Target | None, lines: PowerlineMap | None, p_WB: np.ndarray) -> Target | None:
-        """The place on the mapped line that the goal means."""
+        """Return the target on the mapped line that the goal refers to."""
         return None if lines is None else mapped_target(lines, self._goal, p_WB)
 
     def pattern(self) -> list[Look]:
-        """Lines have to be seen from different places: up and down, nearer (the error of a distance grows with its square), and back."""
+        """Places to observe the lines from: up, closer (the error of a distance grows with its square), down, back, and aside."""
         reach, near = MAPPING_REACH, self.settings.mapping_approach
         return [(np.array(v), 0.0) for v in ((0, 0, reach), (near, 0, reach), (near, 0, 0), (0, 0, 0), (0, reach / 2, 0))]
 
@@ -36,11 +36,11 @@ class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
 
     @property
     def legs(self) -> int:
-        """The first moves of the pattern are flown before any plan."""
+        """Number of moves of the pattern that are flown before any plan."""
         return MAPPING_LEGS
 
     def reach(self, offset: np.ndarray, p: np.ndarray, target: Target | None) -> np.ndarray:
-        """Towards the lines no nearer to the target than `mapping_standoff`."""
+        """As in the base class; a move towards the lines stays at least `mapping_standoff` away from the target."""
         if not offset[0] > 0.0:
             return offset
         room = 0.0 if target is None else float(np.linalg.norm(target.p_WS - p)) - self.settings.mapping_standoff
@@ -48,15 +48,15 @@ class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
 
     @property
     def latency(self) -> float:
-        """Of a plan from a hover [s]."""
+        """Latency of a plan from a hover [s]."""
         return self.settings.powerline_latency
 
     def running(self, plan: Plan, target: Target) -> RunningPlan:
-        """A plan in flight."""
+        """Return a plan and its target as a plan in flight."""
         return RunningPlan.begun(plan, target, self.settings)
 
     def better(self, inputs: Inputs, outputs: Outputs) -> None:
-        """Follow the map as it gets better, and keep a way out ready."""
+        """Update the plan as the map improves, and keep a way out ready."""
         if inputs.plan is not None:
             outputs.way_out, better = self._running.answered(inputs.plan, inputs.time)
             outputs.trajectory_id = self._flown_id
@@ -70,7 +70,7 @@ class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
         outputs.query = self._running.query(inputs.time, inputs.state, target, self._goal)
 
     def waiting(self, inputs: Inputs, outputs: Outputs) -> bool:
-        """The plan goes on into its recovery by itself; until then ways out are still asked for."""
+        """Whether the contact is still awaited. Ways out are requested until the plan continues into its own recovery."""
         if inputs.time <= self._running.plan.end + self.settings.contact_time:
             self.better(inputs, outputs)
             return True

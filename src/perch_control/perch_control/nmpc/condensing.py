@@ -1,8 +1,8 @@
-"""The QP of one iteration as a dense one in the inputs alone: for machines without numba, and where `riccati` finds no active set.
+"""Dense QP of one iteration in the inputs alone: for machines without numba, and where `riccati` finds no active set.
 
 With the defects c_k, `dx_{k+1} = A_k dx_k + B_k du_k + c_k`, and the stage cost `dx' Q dx / 2 + q' dx + R |du|^2 / 2 + r' du`,
-eliminating dx leaves `du' H du / 2 + h' du`; bounds of states become rows. It is also the second implementation that the tests hold
-the first against.
+eliminating dx leaves `du' H du / 2 + h' du`; bounds of states become rows. It also serves the tests as an independent
+implementation to compare `riccati` with.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def condense(A: np.ndarray, B: np.ndarray, c: np.ndarray, Q: np.ndarray, q: np.n
 def solve_condensed(stages: tuple[np.ndarray, ...], X: np.ndarray, U: np.ndarray, dx0: np.ndarray, R: float, target: np.ndarray,
                     terminal: float, low: np.ndarray, high: np.ndarray, x_low: np.ndarray,
                     x_high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What `riccati.solve_stages` finds, with the same arguments: dx (N + 1, n) and du (N, 4).
+    """Solve the problem of `riccati.solve_stages`, with the same arguments: returns dx (N + 1, n) and du (N, 4).
 
     Raises:
         QpFailure: no solution.

@@ -39,8 +39,8 @@ _FAR_LINE = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 1.0, 0.01)
 
 
 class NmpcController(Law):
-    """Owns the iterate (states and inputs over the horizon); falls back to the geometric law where the QP fails and for
-    references that are guidance by state (a recovery)."""
+    """Predictive control law; owns the iterate (states and inputs over the horizon). It falls back to the geometric law where the
+    QP fails, and for references that are guidance by state (a recovery)."""
 
     name = "nmpc"
     slow = True
@@ -72,16 +72,16 @@ class NmpcController(Law):
 
     @classmethod
     def build(cls, vehicle: Vehicle, params: ControllerParameters) -> NmpcController:
-        """Compiled, or found compiled; seconds the first time, a tenth of one later."""
+        """Build the law; this takes seconds where code must be compiled, and about 0.1 s where the compiled code is cached."""
         return cls(vehicle, params.nmpc, GeometricController.build(vehicle, params))
 
     @property
     def compiled(self) -> bool:
-        """The linearisation runs as machine code."""
+        """Whether the linearisation runs as machine code."""
         return self._stages.compiled
 
     def _warm_up(self) -> None:
-        """One step in hover: whatever is compiled on first use is compiled now."""
+        """Run one step in hover, so that everything that is compiled on first use is compiled."""
         hover = (self.vehicle.speed_min + self.vehicle.speed_max) / 2
         rest = (0.0,) * 6 + (0.0, 0.0, 0.0, 1.0) + (0.0,) * 3
         self.control(rest, Resting(), RotorEstimate((hover,) * 4, (hover,) * 4))
@@ -99,10 +99,10 @@ class NmpcController(Law):
         self._x_low[13:], self._x_high[13:], self._price[13:] = self.vehicle.thrust_min, self.vehicle.thrust_max, _THRUST_PRICE
 
     def retune(self, settings: NmpcSettings, fallback: GeometricController) -> None:
-        """New weights from the next period on.
+        """Use new weights from the next period on.
 
         Raises:
-            ConfigError: horizon or the presence of line terms differ: these are compiled in.
+            ConfigError: horizon or presence of line terms differ; these are compiled in.
         """
         old = self.settings
         if settings.horizon != old.horizon:
@@ -113,7 +113,7 @@ class NmpcController(Law):
         self._weights()
 
     def retuned(self, params: ControllerParameters) -> NmpcController:
-        """As `retune`; it is not compiled again."""
+        """As `retune`, from the controller's parameters; nothing is recompiled."""
         self.retune(params.nmpc, GeometricController.build(self._nominal, params))
         return self
 
@@ -122,14 +122,14 @@ class NmpcController(Law):
         self._warm = False
 
     def believe(self, vehicle: Vehicle) -> None:
-        """Fly a vehicle that differs from the one at the start in its thrust: what is compiled in knows thrusts alone."""
+        """Use a vehicle model that differs from the initial one in its thrust; the compiled code takes rotor thrusts only."""
         self.vehicle, self._constants = vehicle, packed_vehicle(vehicle)
         self._rows = self._new_rows()
         self._weights()
         self.fallback.believe(vehicle)
 
     def pace(self, period: float) -> None:
-        """The nodes stay where they are compiled to be, a whole number of new periods apart."""
+        """Use another period of the odometry [s]: the compiled node spacing is kept, as a whole number of new periods."""
         if period == self.period:
             return
         self.period, self._spacing = period, max(1, round(self._dt / period))
@@ -141,7 +141,7 @@ class NmpcController(Law):
         return ReferenceRows(self._constants, _REFERENCE_FLOOR, _NODES * self._spacing, period)
 
     def lines(self, lines: tuple[tuple[float, ...], ...]) -> None:
-        """Powerlines for the soft terms: (centre, direction, half length, radius), 8 floats each; the first is watched."""
+        """Set the powerlines of the soft terms: (centre, direction, half length, radius), 8 floats each; the first is viewed."""
         if not self._lines:
             self._line_time = 0.0
         self._lines = tuple(lines)[:LINES]
@@ -211,7 +211,7 @@ class NmpcController(Law):
 
 
 def _thrust_rate(vehicle: Vehicle) -> float:
-    """Rate that a rotor's lag allows from hover at full command, or the vehicle's own limit [N/s]."""
+    """Largest rate of a rotor's thrust [N/s]: the vehicle's own limit, else that of the lag from hover at full command."""
     if np.isfinite(vehicle.thrust_rate_max):
         return float(vehicle.thrust_rate_max)
     hover = np.sqrt(vehicle.hover_thrust / 4.0 / vehicle.thrust_coefficient)

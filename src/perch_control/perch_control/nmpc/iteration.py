@@ -1,6 +1,6 @@
-"""What surrounds linearisation and QP in one real-time iteration, compiled: at 500 Hz numpy's calls would cost more than the QP.
+"""Compiled parts of a real-time iteration besides the linearisation: at 500 Hz, numpy's calls would cost more than the QP.
 
-`begin` before the linearisation, `finish` after it.
+`begin` is called before the linearisation, `finish` after it.
 """
 
 from __future__ import annotations
@@ -16,21 +16,22 @@ from perch_core.jit import compiled
 
 @compiled
 def begin(state, speed, command, compensation, lead, vehicle, R, ramps, X, U, start, target, z):
-    """Initial state of the horizon, and the arguments of the linearisation.
+    """Compute the initial state of the horizon, and the arguments of the linearisation.
 
-    With 13 states it is predicted to where the rotors have answered; with 17 it is the present one with the present thrusts.
+    With 13 states, the initial state is predicted to the time at which the rotors have responded; with 17 states, it is the
+    present state with the present thrusts.
 
     Args:
         state: p_WB, v_WB, q_WB (xyzw), w_WB_B now, 13 floats.
-        speed, command: rotor speeds now and what they are following [rad/s], 4 floats each.
-        compensation: what makes up for disturbances, 6 floats.
-        lead: from now to there [s].
+        speed, command: present rotor speeds and their commands [rad/s], 4 floats each.
+        compensation: compensation of disturbances, 6 floats.
+        lead: time of the prediction [s].
         vehicle: constants (see `packed_vehicle`).
         R: reference of the nodes, shape (N + 1, 17).
-        ramps: the inputs change over their intervals as the reference's thrusts do; 13 states alone.
-        X, U: iterate, shapes (N + 1, n), (N, 4); its quaternions are brought to the side of the state's.
+        ramps: whether the inputs change over their intervals as the reference's thrusts do; for 13 states only.
+        X, U: iterate, shapes (N + 1, n), (N, 4); the sign of its quaternions is matched to the state's.
         start: result: the initial state, shape (n,).
-        target: result: what the inputs' cost is measured from, shape (N, 4); stays zero for 17 states.
+        target: result: inputs from which the cost is measured, shape (N, 4); stays zero for 17 states.
         z: result: arguments, shape (N + 1, .).
     """
     nodes, n = X.shape
@@ -71,7 +72,7 @@ def begin(state, speed, command, compensation, lead, vehicle, R, ramps, X, U, st
 
 @compiled
 def input_bounds(speed, lead, vehicle, thrust_rate_max, n, low, high):
-    """Bounds of the inputs: thrusts, in the first interval what the rotors can reach; or thrust rates (17 states). Shapes (N, 4)."""
+    """Write the bounds of the inputs, shapes (N, 4): thrusts, in the first interval reachable ones; thrust rates (17 states)."""
     coefficient, speed_min, speed_max, tau = vehicle[1]
     if n == 17:
         floor, ceiling = -thrust_rate_max, thrust_rate_max
@@ -89,7 +90,7 @@ def input_bounds(speed, lead, vehicle, thrust_rate_max, n, low, high):
 
 @compiled
 def apply(dx, du, X, U):
-    """Add a solution to the iterate; quaternions keep their length."""
+    """Add a solution to the iterate; quaternions are normalised."""
     nodes, n = X.shape
     for k in range(nodes):
         for i in range(n):
@@ -118,10 +119,10 @@ def answer(U, n, speed, lead, vehicle):
 
 @compiled
 def finish(stages, X, U, start, weight, target, terminal, low, high, x_low, x_high, price, rounds, work, dx, du, speed, lead, vehicle):
-    """Solve the QP, move the iterate, and answer; arguments as in `solve_stages` and `answer`.
+    """Solve the QP, update the iterate, and return the answer; arguments as in `solve_stages` and `answer`.
 
     Returns:
-        Number of active sets that were tried (0: the right one was not found, and the iterate stays), and `answer`.
+        Number of active sets tried (0: the correct one was not found, and the iterate is unchanged), and the result of `answer`.
     """
     n = X.shape[1]
     for i in range(n):

@@ -1,4 +1,4 @@
-"""Which mapped powerlines the predictive controller knows: the watched one first, then the nearest. [P:VI-A]"""
+"""Choice of the mapped powerlines for the predictive controller: the one to keep in view first, then the nearest. [P:VI-A]"""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def chosen_lines(segments: Sequence[Segment], p_WB: np.ndarray, watched: Sequenc
         watched: a rough point on the line to keep in view in W [m], 3 floats; empty: the line nearest to the vehicle.
 
     Returns:
-        Packed lines; the first is kept in view, all are kept away.
+        Packed lines; the first is kept in view, all are kept at a distance.
     """
     if not segments:
         return ()

@@ -1,4 +1,4 @@
-"""Stage functions for all nodes at once: compiled C in a loop, or interpreted CasADi where there is no compiler."""
+"""Evaluation of the stage function at all nodes at once: compiled C in a loop, or interpreted CasADi without a compiler."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Linearisation:
     Attributes:
         compiled: whether C code runs.
         arguments: filled by the caller, shape (nodes, layout.arguments).
-        stages: of the last `evaluate`: next states (nodes, n), A and B by columns (nodes, n, n), (nodes, 4, n) - so the arrays hold
-            their transposes -, Q (nodes, n, n), q (nodes, n).
+        stages: results of the last `evaluate`: next states (nodes, n), A and B by columns (nodes, n, n), (nodes, 4, n) - so the
+            arrays hold their transposes -, Q (nodes, n, n), q (nodes, n).
     """
 
     def __init__(self, vehicle: Vehicle, step: float, layout: StageLayout, nodes: int) -> None:
@@ -56,6 +56,6 @@ class Linearisation:
             array[:] = np.asarray(result).T.reshape(array.shape)
 
     def evaluate(self) -> tuple[np.ndarray, ...]:
-        """`stages` at the present arguments."""
+        """Evaluate and return `stages` at the present arguments."""
         self._evaluate()
         return self.stages

@@ -1,9 +1,9 @@
 """One stage of the predictive controller as a CasADi function: dynamics, their Jacobians, Gauss-Newton cost. [P:VI, P:eq1]
 
-With 13 states the rotor thrusts are the inputs: an input is that at the node, and may change over the interval as the reference's
-thrusts do; with 17 they are states and their rates are the inputs (`perch_core.rotor_model`). To the rotor model come
-rotor drag and a constant disturbance (force and moment, from the L1 augmentation). The optional line terms are those of the
-powerline planner (`perch_core.lines`).
+With 13 states the rotor thrusts are the inputs: an input is the thrust at the node, and may change over the interval as the
+reference's thrusts do. With 17 states the thrusts are states and their rates are the inputs (`perch_core.rotor_model`). Rotor
+drag and a constant disturbance (force and moment, from the L1 augmentation) are added to the rotor model. The optional line terms
+are those of the powerline planner (`perch_core.lines`).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def _rate(model: RotorModel, drag: Vector, x: Vector, u: Vector, disturbance: Ve
 
 
 def _rk4(f, x: Vector, step: float) -> Vector:
-    """One step of x' = f(x, share of the step)."""
+    """One Runge-Kutta step of x' = f(x, fraction of the step)."""
     def moved(k: Vector, h: float) -> Vector:
         return tuple(a + h * b for a, b in zip(x, k, strict=True))
 
@@ -66,7 +66,7 @@ def _rk4(f, x: Vector, step: float) -> Vector:
 
 
 def _attitude_residual(q: Vector, r: Vector) -> Vector:
-    """2 vec(r^-1 q) on the nearer side: the attitude error in B for small angles [rad]."""
+    """2 vec(r^-1 q) with the sign of the shorter rotation: the attitude error in B for small angles [rad]."""
     x, y, z, w = (-r[0], -r[1], -r[2], r[3])
     e = (
         w * q[0] + q[3] * x + y * q[2] - z * q[1],
@@ -83,7 +83,7 @@ def _hinge(value):
 
 
 def _line_residuals(vehicle: Vehicle, x: Vector, parameters: Vector) -> list:
-    """Soft terms of the powerlines: the first one is kept in view, all are kept away. [P:eq7, P:eq9, P:eq12, P:eq13]"""
+    """Soft terms of the powerlines: the first one is kept in view, all are kept at a distance. [P:eq7, P:eq9, P:eq12, P:eq13]"""
     perception, visibility, collision, margin = parameters[LINES * LINE:]
     p, q = x[P], x[Q]
     first = parameters[0:LINE]
@@ -110,11 +110,11 @@ def _line_residuals(vehicle: Vehicle, x: Vector, parameters: Vector) -> list:
 
 
 def stage(vehicle: Vehicle, step: float, layout: StageLayout) -> ca.Function:
-    """The stage function of a vehicle: of one vector (see `StageLayout`) the next state, its Jacobians A and B, and the Hessian Q and
-    gradient q of the Gauss-Newton cost.
+    """Build the stage function of a vehicle: from one vector (see `StageLayout`) to the next state, its Jacobians A and B, and
+    the Hessian Q and gradient q of the Gauss-Newton cost.
 
     Args:
-        vehicle: its numbers become constants of the code.
+        vehicle: its parameters become constants of the code.
         step: length of a shooting interval [s].
         layout: 13 or 17 states, with or without lines.
     """

@@ -13,7 +13,7 @@ _SOFT = 8  # DAQP's mark of a constraint that may be violated at a price
 
 
 class QpFailure(RuntimeError):
-    """The QP has no solution, or the solver did not find it."""
+    """Raised when the QP has no solution, or the solver has not found it."""
 
 
 def solve(H: np.ndarray, h: np.ndarray, low: np.ndarray, high: np.ndarray, rows: np.ndarray, row_low: np.ndarray,
@@ -43,7 +43,7 @@ def solve(H: np.ndarray, h: np.ndarray, low: np.ndarray, high: np.ndarray, rows:
 
 
 def solve_osqp(H, h, low, high, rows, row_low, row_high, soft) -> np.ndarray:
-    """The same with OSQP; soft rows get slacks."""
+    """As `solve`, with OSQP; soft rows get slack variables."""
     import osqp  # with scipy.sparse 0.1 s of a start that uses DAQP
     from scipy import sparse
 

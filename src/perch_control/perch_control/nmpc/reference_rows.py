@@ -1,7 +1,7 @@
 """References of the shooting nodes: full states and rotor thrusts by flatness, each computed once.
 
-The nodes are a whole number of control periods apart, so what is the last node now will be every other node later: in
-steady flight one new row per period is enough. Rows are taken at the phase of the first call, and all anew where that is off.
+The nodes are a whole number of control periods apart, so that the row of the last node serves every other node later: in
+steady flight one new row per period is enough. Rows have the phase of the first call; where it changes, all are recomputed.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def _three(x, k):
 def reference_row(x, floor, vehicle):
     """p, q, v, w and rotor thrusts of a setpoint, 17 floats. [M:eq9-13]
 
-    A setpoint that carries its b3 keeps it, whatever is added to its acceleration on the way from one reference to another:
-    where there is hardly any thrust, a small acceleration would be a large turn. The thrust is the force's part along it.
+    If a setpoint carries its b3, this is kept, whatever a transition between references adds to its acceleration: at very low
+    thrust, a small acceleration would be a large turn. The thrust is then the component of the force along b3.
 
     Args:
         x: packed setpoint, 33 floats (a tuple or an array).
@@ -69,7 +69,7 @@ def reference_row(x, floor, vehicle):
 
 @compiled
 def missing(stamps, first, spacing, nodes):
-    """Periods of the nodes whose rows are not in the ring."""
+    """Periods of the nodes whose rows are not in the ring buffer."""
     out = np.empty(nodes, np.int64)
     n = 0
     for k in range(nodes):
@@ -82,7 +82,7 @@ def missing(stamps, first, spacing, nodes):
 
 @compiled
 def keep(setpoints, periods, floor, vehicle, rows, stamps):
-    """Put the rows of packed setpoints (n, 33) into the ring, at their periods (n,)."""
+    """Write the rows of packed setpoints (n, 33) to the ring buffer, at their periods (n,)."""
     for k in range(len(periods)):
         slot = periods[k] % len(stamps)
         row = reference_row(setpoints[k], floor, vehicle)
@@ -93,13 +93,13 @@ def keep(setpoints, periods, floor, vehicle, rows, stamps):
 
 @compiled
 def take(rows, stamps, first, spacing, out):
-    """Copy the rows of all nodes out of the ring."""
+    """Copy the rows of all nodes from the ring buffer to `out`."""
     for k in range(len(out)):
         out[k] = rows[(first + k * spacing) % len(stamps)]
 
 
 class ReferenceRows:
-    """Rows of the running reference, kept by control period in a ring as long as the horizon."""
+    """Rows of the running reference, stored by control period in a ring buffer as long as the horizon."""
 
     def __init__(self, vehicle: tuple, floor: float, periods: int, period: float) -> None:
         """

@@ -1,15 +1,15 @@
 """The QP of one iteration solved stage by stage: Riccati recursions inside an active-set iteration.
 
-The bounds are on single inputs (hard) and on single states (soft: their squared excess at a price), so that an active set changes
-stage costs only: a clamped input is a number, an exceeded state bound a diagonal term. With a given set the QP is a linear-quadratic
-problem without bounds,
+The bounds are on single inputs (hard) and on single states (soft: their squared excess is penalised), so that an active set
+changes stage costs only: a clamped input is a number, an exceeded state bound a diagonal term. With a given set the QP is a
+linear-quadratic problem without bounds,
 
     S = B' P_{k+1} A,  M = R + B' P_{k+1} B,  P_k = Q_k + A' P_{k+1} A - S' M^-1 S     (M over the free inputs),
 
-O(N n^3) instead of the O(N^2 n^2) of condensing and the O(N^3) of a dense solver. The next set is read off the solution
-(primal-dual active set, a semismooth Newton method): clamped inputs whose gradient points inwards become free, bounds that are passed
-become active. Where the set repeats itself, its solution is the QP's. The first set is that of the last period, which is mostly right
-at once; the recursion goes back only from the last stage whose set has changed.
+O(N n^3) instead of the O(N^2 n^2) of condensing and the O(N^3) of a dense solver. The next set follows from the solution
+(primal-dual active set, a semismooth Newton method): clamped inputs whose gradient points inwards become free, violated bounds
+become active. Once the set repeats itself, its solution is that of the QP. The initial set is that of the last period, which is
+usually correct; the recursion restarts from the last stage whose set has changed.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class Workspace:
                        np.zeros((4, n)))
 
     def clear(self) -> None:
-        """Nothing is active."""
+        """Clear the active set."""
         self.fixed[:], self.soft[:] = 0, 0
 
 
 @compiled
 def _price_of_excess(X, soft, x_low, x_high, price, P, p):
-    """Add what the state bounds that are active cost to the cost to go of a node."""
+    """Add the penalty of the active state bounds to the cost to go of a node."""
     for i in range(FIRST_BOUNDED, len(X)):
         if soft[i] != 0:
             P[i, i] += price[i]
@@ -53,7 +53,7 @@ def _price_of_excess(X, soft, x_low, x_high, price, P, p):
 
 @compiled
 def _less(x, c, a, k, K):
-    """Row a of the gains less x times row c."""
+    """Subtract x times row c from row a of the gains."""
     k[a] -= x * k[c]
     for j in range(K.shape[1]):
         K[a, j] -= x * K[c, j]
@@ -61,7 +61,7 @@ def _less(x, c, a, k, K):
 
 @compiled
 def _times(x, a, k, K):
-    """Row a of the gains times x."""
+    """Multiply row a of the gains by x."""
     k[a] *= x
     for j in range(K.shape[1]):
         K[a, j] *= x
@@ -112,7 +112,7 @@ def _gains(M, S, m, fixed, low, high, U, K, k, L):
 
 @compiled
 def _backward(last, stages, X, U, R, target, terminal, low, high, x_low, x_high, price, work):
-    """Cost to go and gains of the stages from `last` to 0."""
+    """Compute cost to go and gains of the stages from `last` to 0."""
     f, At, Bt, Q, q = stages
     fixed, soft, P, p, K, k, M, S, m, W, T, v, L = work
     N, n = U.shape[0], X.shape[1]
@@ -186,8 +186,8 @@ def _backward(last, stages, X, U, R, target, terminal, low, high, x_low, x_high,
 
 @compiled
 def _forward(stages, X, U, dx0, low, high, x_low, x_high, work, dx, du):
-    """Solution of the present set, in dx and du; the set that it asks for takes its place. Returns the last stage whose cost changes
-    with it, -1 where none does."""
+    """Write the solution of the present active set to dx and du, and replace the set by the one that follows from it. Returns the
+    last stage whose cost changes with it, -1 where none does."""
     f, At, Bt, _, _ = stages
     fixed, soft, _, _, K, k, M, S, m, _, _, _, _ = work
     N, n = du.shape[0], dx.shape[1]
@@ -245,19 +245,19 @@ def solve_stages(stages, X, U, dx0, R, target, terminal, low, high, x_low, x_hig
 
     Args:
         stages: next states, A', B', Q, q of all nodes (`Linearisation.stages`).
-        X, U: where it was linearised, shapes (N + 1, n), (N, 4).
+        X, U: point of the linearisation, shapes (N + 1, n), (N, 4).
         dx0: deviation of the initial state, shape (n,).
         R, target: weight of the inputs' distance from a target, scalar and shape (N, 4).
         terminal: factor of the last node's cost.
         low, high: bounds of the inputs U + du, shapes (N, 4).
         x_low, x_high: soft bounds of the states X + dx from the body rates on, shapes (n,); infinite: none.
-        price: of half the squared excess over a state's bound, shape (n,).
-        rounds: active sets that may be tried.
+        price: weight of half the squared excess over a state's bound, shape (n,).
+        rounds: greatest number of active sets to try.
         work: `Workspace.arrays`.
-        dx, du: the solution, shapes (N + 1, n), (N, 4).
+        dx, du: results: the solution, shapes (N + 1, n), (N, 4).
 
     Returns:
-        How many sets were tried, 0: the right one was not found.
+        Number of active sets tried, 0: the correct one was not found.
     """
     last = U.shape[0] - 1
     for tried in range(rounds):

@@ -24,7 +24,7 @@ class LineWeights:
 
     @property
     def any(self) -> bool:
-        """Some term is wanted."""
+        """Whether any of the terms is enabled."""
         return self.perception > 0.0 or self.visibility > 0.0 or self.collision > 0.0
 
 

@@ -1,1 +1,1 @@
-"""What every node shares: parameters, QoS, conversions, the arrival host, and the main loop. The only ROS code in perch_core."""
+"""Shared parts of all nodes: parameters, QoS, conversions, arrival host and main loop. The only ROS code in perch_core."""

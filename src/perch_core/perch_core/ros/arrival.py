@@ -1,6 +1,6 @@
-"""The arrival host: a message comes in, the component works, its outputs are published. What `ros2 run` starts, and what flies.
+"""The arrival host: passes each arriving message to the component and publishes its outputs. Used by `ros2 run` and on vehicles.
 
-It needs nothing but the topics: no simulator, no fixed rate, any clock.
+It needs only the topics: no simulator and no fixed rate, with any clock.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ LOOK = 1.0  # between two looks for writers that are not heard [s]
 
 
 class ArrivalNode(ComponentNode):
-    """One component, fed by its topics as they arrive."""
+    """Node of one component whose inputs are processed as their messages arrive."""
 
     def __init__(self, name: str, component: type[Component[Any]], wiring: Wiring, deadline: str = "", **kwargs: Any) -> None:
         """
         Args:
             name, component, wiring, kwargs: as in `ComponentNode`.
-            deadline: output that answers an input of the same stamp within a period: late answers are counted.
+            deadline: output that answers each input of the same stamp within one period; late answers are counted.
         """
         super().__init__(name, component, wiring, **kwargs)
         self._intake = Intake(self)
@@ -61,7 +61,7 @@ class ArrivalNode(ComponentNode):
         self.create_timer(port.period, wake, clock=self._steady)
 
     def _look_for_strangers(self) -> None:
-        """Topics of neighbours are handed on in the process: whoever else publishes them is not heard, and is named once."""
+        """Warn once of each foreign publisher on a topic that a neighbour publishes: its messages are ignored."""
         for topic in sorted(self._intake.private):
             writer = self.wiring.writer(topic) or ""
             for stranger in foreign_writers(self, topic, {writer}):
@@ -70,7 +70,7 @@ class ArrivalNode(ComponentNode):
     # -- requests ----------------------------------------------------------------------------------------------------
 
     def bring(self, port: Service[Any, Any] | Action, work: Callable[..., None], *arguments: Any) -> None:
-        """As it comes."""
+        """Call `work` at once."""
         self.wiring.enter(self.guarded, port.name, work, *arguments)
 
     def _deliver_answer(self, port: Client[Any, Any], answer: Any) -> None:
@@ -79,11 +79,11 @@ class ArrivalNode(ComponentNode):
     # -- people ------------------------------------------------------------------------------------------------------
 
     def host_figures(self) -> dict[str, Any]:
-        """Late answers."""
+        """Figures of the deadlines; empty without a deadline."""
         return self._deadlines.report() if self._deadlines is not None else {}
 
     def hurry(self) -> None:
-        """Ask for real-time scheduling: every input has a deadline."""
+        """Request real-time scheduling if the node has a deadline."""
         if self._deadlines is None:
             return
         self.wiring.paced = priority.nodes > 1

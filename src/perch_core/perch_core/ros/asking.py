@@ -20,7 +20,7 @@ Deliver = Callable[[Client[Any, Any], Any], None]
 
 
 def connect_clients(node: Node, component: Component[Any], deliver: Deliver) -> None:
-    """Make a component's clients; `deliver(port, answer)` takes each answer on the executor's thread."""
+    """Create the clients of a component; `deliver(port, answer)` takes each answer on the executor's thread."""
     for port in ports(type(component), Client):
         row = topics.service(port.channel(component))
         client = node.create_client(row.type, port.channel(component))
@@ -29,13 +29,13 @@ def connect_clients(node: Node, component: Component[Any], deliver: Deliver) -> 
 
 
 def _servers(node: Node, client: Any) -> set[bytes]:
-    """The servers of a client: who publishes its replies, under the name that the middleware gives them."""
+    """Return the servers of a client: the publishers of its reply topic, under the middleware's name of the topic."""
     replies = f"rr{node.resolve_service_name(client.srv_name)}Reply"
     return {bytes(info.endpoint_gid) for info in node.get_publishers_info_by_topic(replies, no_mangle=True)}
 
 
 def _watch(node: Node, component: Component[Any], client: Any) -> None:
-    """Say when a server is started anew, also where no request was open meanwhile: what it had been told is forgotten."""
+    """Warn when another server appears, also while no request is open: a restarted server has lost its state."""
     known = set[bytes]()
 
     def look() -> None:
@@ -48,7 +48,7 @@ def _watch(node: Node, component: Component[Any], client: Any) -> None:
 
 
 def _asker(node: Node, port: Client[Any, Any], row: topics.ServiceRow, client: Any, deliver: Deliver) -> Callable[[Any, int], None]:
-    """A request goes to every server that appears until one has answered: who was asked first may have ended, and been started anew."""
+    """Return a function that sends a request to every server that appears until one has answered: a server may be restarted."""
     def ask(request: Any, due: int) -> None:
         message, asked, calls = row.request_message(request), set[bytes](), list[Any]()
         unanswered, seen = True, time.monotonic()
@@ -81,7 +81,7 @@ def _asker(node: Node, port: Client[Any, Any], row: topics.ServiceRow, client: A
 
 
 def _answer(row: topics.ServiceRow, future: Any) -> Any:
-    """The value of a finished call."""
+    """Return the value of a finished call, or `Unavailable`."""
     response = future.result()
     if response is None:
         return Unavailable(f"{row.channel} failed: {future.exception()}")

@@ -1,4 +1,4 @@
-"""The ROS side of one component that both ROS hosts share: parameters, outputs, services, actions, clients, jobs, log, diagnostics."""
+"""ROS side of a component, shared by both ROS hosts: parameters, outputs, services, actions, clients, jobs, log, diagnostics."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ _NUMBERS = re.compile(r"[-+.\de]*\d")  # what differs between lines of one kind
 
 
 class ComponentNode(Node):
-    """A component and its topics. Subclasses bring its inputs to it."""
+    """Node with one component and its topics. Subclasses pass the inputs to it."""
 
     def __init__(self, name: str, component: type[Component[Any]], wiring: Wiring, **kwargs: Any) -> None:
         """
         Args:
             name: of the node.
-            component: what it does.
-            wiring: the nodes of this process.
-            kwargs: of `rclpy.node.Node`: `cli_args`, `parameter_overrides`, `namespace`, `context`.
+            component: class of the component.
+            wiring: connections among the nodes of this process.
+            kwargs: arguments of `rclpy.node.Node`: `cli_args`, `parameter_overrides`, `namespace`, `context`.
 
         Raises:
             ConfigError: a parameter is refused.
@@ -85,18 +85,18 @@ class ComponentNode(Node):
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """Those that the executor watches."""
+        """Subscriptions that the executor watches."""
         return (subscription for subscription in super().subscriptions if subscription not in self._unwatched)
 
     def create_unwatched(self, message: type, channel: str, profile: QoSProfile) -> Subscription:
-        """A subscription whose messages, serialised, wait to be taken; the executor is not woken by them."""
+        """Create a subscription whose serialised messages wait to be taken and do not wake the executor."""
         subscription = self.create_subscription(message, channel, lambda _: None, profile, raw=True)
         self._unwatched.add(subscription)
         return subscription
 
     def take_time_here(self) -> None:
-        """Simulation time of a vehicle in this process comes as values do: a message of it to every node, 100 times a second, makes
-        steps late. All nodes of the process are there by now."""
+        """Receive simulation time as values if its publisher is in this process: messages to every node, 100 times a second,
+        would delay steps. Called when all nodes of the process exist."""
         for subscription in tuple(self.subscriptions):
             topic = subscription.topic_name
             if subscription.msg_type is ClockMessage and not subscription.raw and self.wiring.writer(topic) is not None:
@@ -130,13 +130,13 @@ class ComponentNode(Node):
         return partial(self.wiring.emit, topic, publication)
 
     def _wanted(self, emitter: Emitter[Any], topic: str, publication: Publication) -> Callable[[], bool]:
-        """Who takes values beside this host, a neighbour, or somebody outside."""
+        """Return a check whether an output has a receiver: a neighbour, a subscriber, or one besides this host."""
         return lambda: len(emitter.receivers) > 1 or self.wiring.read_here(topic) or publication.heard()
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
     def serve(self) -> None:
-        """Offer the component's services and actions, when requests can be handled."""
+        """Wait until isolated jobs can run, then offer the component's services and actions."""
         self._jobs.wait_ready()
         for service in ports(type(self.component), Service):
             self._serve(service)
@@ -183,7 +183,7 @@ class ComponentNode(Node):
         server = GoalServer(self, row.type, channel, begin, accept)
 
     def begin_request(self, port: Service[Any, Any], row: topics.ServiceRow, request: Any, answer: Callable[[Any], None]) -> None:
-        """Hand a request to the component; one that it fails on before its answer is refused."""
+        """Pass a request to the component; if the component fails before it has answered, refuse the request."""
         answered = False
 
         def reply(value: Any) -> None:
@@ -199,7 +199,7 @@ class ComponentNode(Node):
             raise
 
     def begin_goal(self, port: Action, goal: ServedGoal) -> None:
-        """Hand a goal to the component; one that it rejects or fails on ends at once."""
+        """Pass a goal to the component; if the component rejects it or fails, end it at once."""
         try:
             why = port.handler(self.component)(goal)
         except Exception as error:
@@ -211,11 +211,11 @@ class ComponentNode(Node):
             goal.reject(why)
 
     def bring(self, port: Service[Any, Any] | Action, work: Callable[..., None], *arguments: Any) -> None:
-        """Bring a request or a goal to the component: call `work` when it is its turn."""
+        """Schedule a request or a goal: call `work` with `arguments` in the order of the host."""
         raise NotImplementedError
 
     def connect(self) -> None:
-        """Take the inputs, offer the services. All nodes of the process are there by now."""
+        """Subscribe to the inputs and offer the services; called when all nodes of the process exist."""
         raise NotImplementedError
 
     # -- parameters --------------------------------------------------------------------------------------------------
@@ -253,13 +253,13 @@ class ComponentNode(Node):
             logger.debug(line.text)
 
     def warn_once(self, text: str) -> None:
-        """Warn, once of each text."""
+        """Log a warning, each text only once."""
         if text not in self._warned:
             self._warned.add(text)
             self.get_logger().warning(text)
 
     def _beat(self) -> None:
-        """Whoever looks at `/diagnostics` tells by it a node that hangs from one with nothing to do."""
+        """Repeat the last diagnostics while the component emits none, so that an idle node differs from one that hangs."""
         if time.monotonic() - self._reported >= HEARTBEAT:
             self._publish_diagnostics(replace(self._report, stamp=self.get_clock().now().nanoseconds))
 
@@ -277,11 +277,11 @@ class ComponentNode(Node):
         self._diagnostics.publish(message)
 
     def host_figures(self) -> dict[str, Any]:
-        """What the host adds to the diagnostics."""
+        """Return the values that the host adds to the diagnostics."""
         return {}
 
     def guarded(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
-        """Call the component, and keep how long it takes; what it cannot take is said and dropped, and never ends the node."""
+        """Call the component and record the duration; an exception is logged, its value is dropped, and the node continues."""
         begin = time.perf_counter()
         try:
             work(*arguments)
@@ -290,7 +290,7 @@ class ComponentNode(Node):
         self._durations[what].append(time.perf_counter() - begin)
 
     def refused(self, what: str, error: Exception) -> None:
-        """Say that something was refused; what nobody has foreseen is a defect. Called while the exception is handled."""
+        """Log a refusal; any exception but a `PerchError` counts as a defect. Call it while the exception is being handled."""
         if isinstance(error, PerchError):
             self._log(LogLine("warning", f"{what} refused: {error}", every=1.0))
             return
@@ -298,6 +298,6 @@ class ComponentNode(Node):
         self._log(LogLine("error", f"{what}: a defect of this node, its value is dropped:\n{traceback.format_exc()}", every=1.0))
 
     def close(self) -> None:
-        """Free what the component and its jobs hold."""
+        """Release the resources of the component and its jobs."""
         self._jobs.close()
         self.component.close()

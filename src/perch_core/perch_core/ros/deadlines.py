@@ -11,13 +11,13 @@ MOVED = 50          # so many late answers on end: stamps have lost time to the 
 
 
 def median_and_p99(samples: Iterable[float]) -> tuple[float, float]:
-    """Of at least one sample. numpy takes ten times as long, half a control period, for the 500 of a second."""
+    """Median and 99th percentile of at least one sample. numpy takes ten times as long: half a control period for 500 samples."""
     ordered = sorted(samples)
     return ordered[(len(ordered) - 1) // 2], ordered[int(0.99 * (len(ordered) - 1))]
 
 
 def durations_us(name: str, seconds: Collection[float]) -> dict[str, float]:
-    """Median and 99th percentile of durations [s] for /diagnostics, in microseconds; nothing without any."""
+    """Median and 99th percentile of durations [s] for /diagnostics, in microseconds; empty without durations."""
     if not seconds:
         return {}
     median, p99 = median_and_p99(seconds)
@@ -27,12 +27,12 @@ def durations_us(name: str, seconds: Collection[float]) -> dict[str, float]:
 class Deadlines:
     """Counts answers that left too late by the wall clock, and steps that were never answered.
 
-    In real time stamps advance with the wall clock, so `clock - stamp` is the same for every answer but for delays. Its
-    least value in the last second belongs to an undelayed answer. An answer is *missed* when it leaves more than one
-    period later than that: its successor was due by then. Whoever delayed it counts: the vehicle, the node, or the
-    operating system. The period is that of the stamps, whatever the IMU's rate. Where the vehicle gives up time that it
-    cannot catch up, the stamps stay behind the wall clock for good: `MOVED` answers are missed, then those count as
-    undelayed that come as late. Where time is simulated there are no deadlines, and nobody calls this.
+    In real time stamps advance with the wall clock, so `clock - stamp` is the same for every answer except for delays. Its
+    least value over the last `WINDOW` answers belongs to an undelayed answer. A deadline is *missed* when an answer leaves more
+    than one period later than that: its successor was due by then. Delays count whether caused by the vehicle, the node or
+    the operating system. The period is that of the stamps, whatever the IMU's rate. Where the vehicle skips time that it
+    cannot catch up, the stamps stay behind the wall clock: `MOVED` late answers in a row count as missed, then their least
+    offset is taken as undelayed. In simulated time there are no deadlines, and this class is not used.
     """
 
     def __init__(self) -> None:
@@ -45,11 +45,11 @@ class Deadlines:
         self._lateness: deque[int] = deque(maxlen=WINDOW)
 
     def answered(self, stamp: int, now: int) -> None:
-        """An answer has left.
+        """Record an answer that has been sent.
 
         Args:
-            stamp: of the step that it answers [ns].
-            now: a monotonic clock [ns].
+            stamp: stamp of the answered step [ns].
+            now: time of a monotonic clock [ns].
         """
         offset, last = now - stamp, self._last
         self._last = stamp
@@ -80,7 +80,7 @@ class Deadlines:
             self._least = self._coming = self._on_end_least
 
     def report(self) -> dict[str, int | float]:
-        """Figures for /diagnostics: counts since the start, and the delay of the last second's answers."""
+        """Figures for /diagnostics: counts since the start, and the delay of the last `WINDOW` answers."""
         values: dict[str, int | float] = {"deadlines": self.answers, "missed_deadlines": self.missed}
         if self._lateness:
             values["delay_us_p99"] = 1e-3 * median_and_p99(self._lateness)[1]

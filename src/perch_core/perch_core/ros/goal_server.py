@@ -1,4 +1,4 @@
-"""An action server whose goals end when the component says so."""
+"""Action server whose goals are finished by the component."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from rclpy.qos import QoSProfile
 class GoalServer(ActionServer):
     """Starts a goal with a callback and ends it with `finish`, without a coroutine in between.
 
-    rclpy 7.1 polls a coroutine that waits for a future on every turn of its executor: one waiting goal keeps one core busy.
+    rclpy 7.1 polls a coroutine that waits for a future in every iteration of its executor: one waiting goal would occupy a core.
     """
 
     def __init__(self, node: Node, action: Any, name: str, begin: Callable[[ServerGoalHandle], None],
                  accept: Callable[[Any], GoalResponse]) -> None:
         """
         Args:
-            node: the node.
+            node: node that offers the action.
             action: type of the action.
             name: its name.
             begin: called with the handle of each accepted goal, which is executing by then.
-            accept: says whether a goal is accepted.
+            accept: returns whether a goal is accepted.
         """
         self._begin = begin
         kept = QoSProfile(depth=WAITING)
@@ -38,7 +38,7 @@ class GoalServer(ActionServer):
         self._begin(goal_handle)
 
     def finish(self, goal_handle: ServerGoalHandle, result: Any) -> None:
-        """Send the result of a goal whose end state is set."""
+        """Send the result of a goal whose final state is set."""
         super().notify_execute(goal_handle, lambda _: result)
 
     @staticmethod
@@ -47,7 +47,7 @@ class GoalServer(ActionServer):
 
 
 class ServedGoal:
-    """A goal as the component has it: `perch_core.component.Goal`."""
+    """A goal as it is passed to the component; implements `perch_core.component.Goal`."""
 
     def __init__(self, server: GoalServer, handle: ServerGoalHandle, row: Any) -> None:
         self._server, self._handle, self._row = server, handle, row
@@ -56,15 +56,15 @@ class ServedGoal:
 
     @property
     def cancel_requested(self) -> bool:
-        """Whoever sent it wants it to end."""
+        """Whether the client has requested cancellation."""
         return bool(self._handle.is_cancel_requested)
 
     def feedback(self, value: Any) -> None:
-        """Tell whoever sent it how it goes."""
+        """Send feedback to the client."""
         self._handle.publish_feedback(self._row.feedback_message(value))
 
     def finish(self, ending: str, result: Any) -> None:
-        """End it: "succeeded", "cancelled" (only where that was asked for) or "aborted"."""
+        """End the goal: "succeeded", "cancelled" (only where that was requested) or "aborted"."""
         self.finished = True
         if ending == "succeeded":
             self._handle.succeed()
@@ -75,5 +75,5 @@ class ServedGoal:
         self._server.finish(self._handle, self._row.result_message(result))
 
     def reject(self, why: str) -> None:
-        """End it before it has begun."""
+        """Abort the goal with the reason for its rejection."""
         self.finish("aborted", self._row.rejected(why))

@@ -1,4 +1,4 @@
-"""From topics to the inputs of a component, as messages arrive."""
+"""Subscriptions that pass arriving messages to the inputs of a component."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ SHARED = ("/tf", "/tf_static")  # topics with many writers, inside this process 
 
 
 class Intake:
-    """Subscriptions of one node. Lazy inputs wait in the middleware and are taken before the next value that is not lazy.
+    """Subscriptions of one node. Messages of lazy inputs wait in the middleware until the next input that is not lazy.
 
     Attributes:
-        private: topics that a neighbour publishes, resolved; they are handed on in the process, and nobody else is heard.
+        private: resolved names of topics that a neighbour publishes; their values are passed in the process, others ignored.
     """
 
     def __init__(self, node: ComponentNode) -> None:
@@ -35,7 +35,7 @@ class Intake:
         self.private: set[str] = set()
 
     def add(self, port: Input[Any]) -> None:
-        """Take an input from its topic."""
+        """Subscribe to the topic of an input."""
         node, channel = self._node, port.channel(self._node.component)
         try:
             row = topics.topic(channel)
@@ -69,7 +69,7 @@ class Intake:
         return subscription
 
     def _match_publishers(self) -> None:
-        """Take a topic that is kept as best effort where somebody publishes it so: a reliable subscription gets nothing of that."""
+        """Resubscribe as best effort to topics with a best-effort publisher, which a reliable subscription does not match."""
         for kept in tuple(self._kept):
             subscription, port, row, receive = kept
             publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
@@ -80,7 +80,7 @@ class Intake:
                 self._node.destroy_subscription(subscription)
 
     def take_lazy(self) -> None:
-        """Take what waits in the middleware."""
+        """Process the messages of lazy inputs that wait in the middleware."""
         for subscription, receive in self._lazy:
             with subscription.handle:
                 while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
@@ -93,7 +93,7 @@ class Intake:
         return lambda value: handler(Serialized(topic, getattr(value, "stamp", 0), topics.encode(channel, value), row.message))
 
     def enter(self, work: Callable[[Any], None], argument: Any) -> None:
-        """Do what woke the node; what waits goes first."""
+        """Process the event that woke the node, after the waiting messages of lazy inputs."""
         if self._lazy:
             self._wiring.enter(self.take_lazy)
         self._wiring.enter(work, argument)
@@ -104,14 +104,14 @@ class Intake:
 
 
 class _Reader:
-    """Reads the messages of a topic, no more of them in a second than its row allows."""
+    """Reads the messages of a topic, at most as many per second as its row allows."""
 
     def __init__(self, node: ComponentNode, channel: str, row: topics.Topic, handler: Callable[[Any], None]) -> None:
         self._node, self._channel, self._row, self._handler = node, channel, row, handler
         self._second, self._count = 0, 0
 
     def __call__(self, data: bytes) -> None:
-        """Hand on what a serialised message holds."""
+        """Pass the values of a serialised message to the handler."""
         try:
             if self._row.often:
                 self._count_it()

@@ -1,4 +1,4 @@
-"""Long work of a component, away from the executor's thread."""
+"""Execution of a component's jobs outside the executor's thread."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Jobs:
         """
         Args:
             deliver: `deliver(function, argument)` calls a function on the executor's thread; any thread may call it.
-            preload: loads what isolated jobs use; None: there are none, or they load it themselves.
+            preload: loads what isolated jobs use; None: there are no isolated jobs, or they load it themselves.
         """
         self._deliver = deliver
         self._thread: ThreadPoolExecutor | None = None
@@ -34,7 +34,7 @@ class Jobs:
             raise PerchError("the process for isolated jobs does not come up")
 
     def submit(self, job: Job) -> None:
-        """Begin a job, or queue it behind those before; `job.then` gets its result."""
+        """Submit a job; it begins after the jobs before it, and `job.then` receives its result."""
         if job.isolated:
             if self._process is None:
                 self._process = IsolatedRunner()
@@ -54,7 +54,7 @@ class Jobs:
         self._deliver(job.then, error if error is not None else future.result())
 
     def close(self) -> None:
-        """Stop what runs in a process; a thread is left to its end."""
+        """Stop isolated jobs; a job on the thread runs to its end."""
         if self._process is not None:
             self._process.close()
         if self._thread is not None:

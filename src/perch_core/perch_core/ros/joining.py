@@ -1,4 +1,4 @@
-"""How a process of ours joins the ROS graph."""
+"""Initialisation of ROS in a process."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perch_core.ros.shared_memory import end_unfinished
 
 
 def join(args: Sequence[str] | None = None, context: Context | None = None) -> None:
-    """`rclpy.init`, where signals stay the caller's, and a process that was killed while it joined holds nobody up.
+    """Call `rclpy.init` without its signal handlers, after removing shared memory that a killed process left unfinished.
 
     Args:
         args: command line with the ROS arguments; None: this process's own.

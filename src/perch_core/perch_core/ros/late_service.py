@@ -1,4 +1,4 @@
-"""A service whose answers come later."""
+"""Service whose responses may be sent later."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 WAITING = 1000
-"""Requests, and answers that were not yet taken by who asked; ROS keeps ten, and drops the others without a word."""
+"""Queue size of requests, and of responses that a client has not yet taken; by default, ROS silently drops all but ten."""
 
 
 class LateService:
-    """Takes requests at once and sends each response when it is there.
+    """Takes requests at once and sends each response when it is available.
 
-    rclpy answers with what a callback returns: the node waits while the callback works. A coroutine would be polled on every turn
-    of the executor (7.1), which keeps the core busy that the work needs. So the callback returns an empty response, and
-    what was to be sent with it, the request's header, is kept for the real one.
+    rclpy sends what a callback returns, so that the node is blocked while the callback works. A coroutine would be polled in
+    every iteration of the executor (7.1), which occupies the core that the work needs. Therefore the callback returns an empty
+    response, which is not sent, and the request's header is kept for the actual one.
     """
 
     def __init__(self, node: Node, srv_type: Any, name: str, take: Callable[[Any, Callable[[Any], None]], None]) -> None:
         """
         Args:
-            node: offers the service.
-            srv_type: of the service.
-            name: of the service.
+            node: node that offers the service.
+            srv_type: type of the service.
+            name: name of the service.
             take: called with a request and the function that sends its response, once.
         """
         self._take = take

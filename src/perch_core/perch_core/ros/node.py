@@ -1,4 +1,4 @@
-"""From a component to a node: its executable, alone or together with others in one process."""
+"""Executables of nodes: a component as a node, alone or together with others in one process."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class NodeOf:
     """A node that can be started.
 
     Attributes:
-        name: of the node and its executable.
-        component: what it does.
-        choose: its component by the parameter `type`, where there are several.
+        name: name of the node and its executable.
+        component: class of the component.
+        choose: returns the class for the parameter `type`, where there are several.
         deadline: output whose answers have a deadline in real time; empty: none.
-        lockstep: host of its node in lockstep, `module:class`.
+        lockstep: class of the node in lockstep, `module:class`.
     """
 
     name: str
@@ -51,7 +51,7 @@ class NodeOf:
     choose: Callable[[str], type[Component[Any]]] | None = None
 
     def create(self, wiring: Wiring | None = None, **kwargs: Any) -> ComponentNode:
-        """The node, of the host that the parameter `lockstep` asks for. `kwargs` go to `rclpy.node.Node`.
+        """Create the node, with the host that the parameter `lockstep` selects. `kwargs` go to `rclpy.node.Node`.
 
         Raises:
             ConfigError: a parameter is refused.
@@ -65,23 +65,23 @@ class NodeOf:
             return ArrivalNode(self.name, component, wiring, deadline=self.deadline, **kwargs)
 
     def main(self) -> None:
-        """Entry point of the executable: run until SIGINT or SIGTERM; exit code 0, or 2 when the caller's parameters are refused."""
+        """Entry point of the executable: run until SIGINT or SIGTERM; exit code 0, or 2 when parameters are refused."""
         run(lambda wiring: [self.create(wiring)], None)
 
 
 def node(name: str, component: type[Component[Any]], deadline: str = "", lockstep: str = LOCKSTEP,
          choose: Callable[[str], type[Component[Any]]] | None = None) -> NodeOf:
-    """A node file is `NODE = node("controller", Controller)` and `create, main = NODE.create, NODE.main`."""
+    """Return a `NodeOf`. Node files have `NODE = node("controller", Controller)` and `create, main = NODE.create, NODE.main`."""
     return NodeOf(name, component, deadline, lockstep, choose)
 
 
 @contextmanager
 def _given(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> Iterator[dict[str, Any]]:
-    """Parameters that decide what the node is: their given values, read from a probe of its name that ends before there is the node.
+    """Yield the given values of the parameters that decide the node's class, read from a probe node of the same name.
 
-    Two nodes of a name are one in the graph, and what the node publishes would go from there with the probe. Until there is the node another
-    one lives: else the probe's end would be that of the process's participant, and Fast DDS may wait for ever where a participant ends while
-    it discovers others.
+    The probe ends before the node is created: two nodes of one name are one in the graph, and the publishers of the node would
+    leave it with the probe. Another node lives until the node exists: without it, the end of the probe would be that of
+    the process's participant, and Fast DDS may wait for ever where a participant ends while it discovers others.
     """
     plain: dict[str, Any] = {"enable_rosout": False, "start_parameter_services": False}
     keeper = Node(f"_{name}_starting", use_global_arguments=False, context=kwargs.get("context"), **plain)
@@ -98,12 +98,12 @@ def _given(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> Iterato
 
 
 class StopSignal:
-    """Becomes true with SIGINT or SIGTERM.
+    """Flag that becomes true on SIGINT or SIGTERM.
 
-    rclpy's own handlers end a wait by an exception out of whatever callback runs, which EventsExecutor cannot pass on;
-    a flag lets the callback finish. Until `patient` is set there is no callback of ROS: then it ends the process at once, by SystemExit.
-    What Python would print of that is not printed: where C code has called Python (numba loads its cache so) SystemExit is lost, and the flag
-    ends the process; objects that were being made fail as they are deleted.
+    rclpy's own handlers raise an exception in the running callback, which EventsExecutor cannot propagate; a flag lets the
+    callback finish. Until `patient` is set, no callback of ROS runs, and a signal ends the process at once by SystemExit.
+    Python's messages about ignored exceptions are then suppressed: where C code has called Python (as numba does to load its
+    cache), SystemExit is lost and the flag ends the process; objects under construction fail when they are deleted.
     """
 
     def __init__(self) -> None:
@@ -122,11 +122,11 @@ class StopSignal:
 
 
 def spin_until_stopped(executor: Executor, stop: StopSignal) -> None:
-    """Run callbacks until the signal.
+    """Run callbacks until the stop signal.
 
-    EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6, and spin_once() starts anew for every message, which
-    costs 30 us of each; so it waits, a tenth of a second at a time, for a future. The time limit is looked at only when nothing
-    waits to be called, which in lockstep may never be: there a timer completes the future.
+    EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6, and spin_once() restarts for every message, which
+    costs 30 us each. Therefore this function waits for a future, 0.1 s at a time. The executor checks this time-out only when no
+    callback is pending, which in lockstep may never be the case: a timer completes the future.
     """
     stopped = Future()
 
@@ -140,7 +140,7 @@ def spin_until_stopped(executor: Executor, stop: StopSignal) -> None:
 
 
 def connect(nodes: Sequence[ComponentNode], executor: Any) -> None:
-    """Connect nodes that share a process; all of them are there by now."""
+    """Connect nodes that share a process, when all of them exist."""
     for one in nodes:
         one.take_time_here()
         executor.add_node(one)
@@ -150,7 +150,7 @@ def connect(nodes: Sequence[ComponentNode], executor: Any) -> None:
 
 
 def close_nodes(nodes: Sequence[ComponentNode]) -> None:
-    """Free threads, processes and files of the nodes, the last one's first, then the nodes: all, whatever one of them raises."""
+    """Release threads, processes and files of all nodes, last node first, then destroy the nodes, even if one raises."""
     with ExitStack() as endings:
         for one in nodes:
             endings.callback(one.destroy_node)
@@ -159,10 +159,10 @@ def close_nodes(nodes: Sequence[ComponentNode]) -> None:
 
 
 def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | None) -> NoReturn:
-    """Run the nodes that `create` makes until SIGINT or SIGTERM.
+    """Run the nodes that `create` returns until SIGINT or SIGTERM.
 
-    Exit code 0, or 2 when a parameter is refused. Fast DDS 2.14 may wait for ever where a participant ends while one of its readers
-    is told of a message, in the C library's exit, too: after `END_LIMIT` SIGALRM ends the process.
+    Exit code 0, or 2 when a parameter is refused. Fast DDS 2.14 may wait for ever where a participant ends while one of its
+    readers is notified of a message, even in the C library's exit: after `END_LIMIT`, SIGALRM ends the process.
     """
     nodes: list[ComponentNode] = []
     stop = StopSignal()
@@ -194,7 +194,7 @@ def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | N
 
 
 def _check_parameter_files(arguments: Sequence[str]) -> None:
-    """rcl's own complaint about a missing file names a line of its C code too."""
+    """Raise ConfigError for a missing parameter file: rcl's own message includes a line of its C code."""
     for option, file in zip(arguments, arguments[1:]):
         if option == "--params-file" and not os.path.isfile(file):
             raise ConfigError(option, file, "no such file")

@@ -42,9 +42,9 @@ def _numeric(kind: Any) -> bool:
 
 
 def descriptor(item: Field[Any], kind: Any, read_only: bool) -> ParameterDescriptor:
-    """What `ros2 param describe` shows: meaning, unit, range, options.
+    """Return the descriptor that `ros2 param describe` shows: meaning, unit, range, options.
 
-    Ranges of lists stand in the description only: ROS has none for them. An exclusive bound becomes the next number above it.
+    Ranges of lists are only given as text, as ROS has no ranges for lists. An exclusive bound becomes the next number above it.
     """
     meta = item.metadata
     bound: Callable[[str], Any] = meta.get
@@ -66,7 +66,7 @@ def descriptor(item: Field[Any], kind: Any, read_only: bool) -> ParameterDescrip
 
 
 def _plain(value: Any) -> Any:
-    """Tuples, and the arrays in which rclpy hands over what came by service, as lists."""
+    """Convert tuples, and the arrays that rclpy delivers for service requests, to lists."""
     return list(value) if isinstance(value, (tuple, array)) else value
 
 
@@ -77,7 +77,7 @@ def _value_at(instance: Any, name: str) -> Any:
 
 
 class Parameters(typing.Generic[T]):
-    """The parameters of a node. `.value` is the present frozen dataclass; it is replaced as a whole on every change."""
+    """The parameters of a node. `.value` is the current frozen dataclass; it is replaced as a whole on every change."""
 
     def __init__(self, node: Node, cls: type[T], changeable: tuple[str, ...], on_change: Callable[[T], None]) -> None:
         """Declare every field of `cls` on `node` and read its overrides.
@@ -85,7 +85,7 @@ class Parameters(typing.Generic[T]):
         Args:
             node: its name is the source in error messages.
             cls: configuration class (see perch_core.config); nested parts become dotted names.
-            changeable: beginnings of the names that may change after the start; the others are read-only.
+            changeable: prefixes of the names that may change after the start; the others are read-only.
             on_change: called with the new value after an accepted `ros2 param set`; it may raise ConfigError to refuse.
 
         Raises:
@@ -105,7 +105,7 @@ class Parameters(typing.Generic[T]):
         node.add_on_set_parameters_callback(self._set)
 
     def _shown(self, name: str, kind: Any, within: T) -> Any:
-        """A value as ROS takes it; an empty list has no type of its own there."""
+        """Return a value as ROS accepts it; an empty list needs an explicit type."""
         value = _plain(_value_at(within, name))
         if value == []:
             element = next((a for a in typing.get_args(kind) if isinstance(a, type)), str)
@@ -114,10 +114,10 @@ class Parameters(typing.Generic[T]):
         return value
 
     def checked(self, changes: list[Parameter]) -> list[Parameter]:
-        """Changes as they can be made, with whole numbers as real ones where these are wanted.
+        """Return the changes after checking them, with integers converted to real numbers where these are required.
 
         Raises:
-            ConfigError: it names a parameter that is unknown, of another type, or out of range; rclpy's own refusals do not.
+            ConfigError: a parameter is unknown, of another type, or out of range; unlike rclpy's refusals, the error names it.
         """
         for change in changes:
             if change.name not in self._leaves and not self._node.has_parameter(change.name):

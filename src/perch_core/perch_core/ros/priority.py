@@ -1,4 +1,4 @@
-"""Who goes first where processors are short: nodes with deadlines, then everyone, then work that has time."""
+"""Scheduling priorities on busy processors: nodes with deadlines first, then ordinary threads, then work without urgency."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from perch_core.processes import give_way
 PRIORITY = 10  # of SCHED_FIFO: above everything ordinary, below the kernel's own threads
 NICE = 10      # of work that has time
 SPINS = "dds.asyn"
-"""Beginning of the names of Fast DDS's asynchronous writers, which send what is too large for one message. They spin while another
-thread is about to remove a sample: at a priority that this thread cannot interrupt they keep it from its processor without end."""
+"""Prefix of the names of Fast DDS's asynchronous writer threads, which send data too large for one packet. They spin while
+another thread is about to remove a sample: at a priority that this thread cannot preempt, they would block it for ever."""
 
 
 class Priority:
-    """Asks the operating system to run this process's loop before everything that has no deadline.
+    """Scheduling priority of this process's threads: real time for the callbacks, or lower than ordinary for slow participants.
 
-    Without it a busy program beside the nodes takes its fair share of the cores in slices of several milliseconds, longer than
-    a control period. The thread of the callbacks and those of rclpy and the middleware are raised; threads of Python, which
-    compile and solve, and those that `SPINS` names stay ordinary, and threads and processes that come later do not inherit it.
+    Without real-time priority, other busy programs take their share of the cores in slices of several milliseconds, longer than
+    a control period. `ask` raises the thread of the callbacks and those of rclpy and the middleware. Threads of Python, which
+    compile and solve, and those that `SPINS` names remain ordinary; threads and processes started later do not inherit it.
     """
 
     def __init__(self) -> None:
         self.nodes = 0  # that this process runs and does nothing else; 0: it is a test
 
     def ask(self) -> str:
-        """Raise the threads; returns why that was not possible, or nothing."""
+        """Raise the threads; return why that was not possible, or an empty string."""
         if self.nodes == 0:
             return ""
         ordinary = {thread.native_id for thread in threading.enumerate() if thread is not threading.main_thread()}
@@ -43,9 +43,9 @@ class Priority:
         return ""
 
     def give_way(self) -> None:
-        """Let others go first: everyone waits for the chain of a simulated step, and a slow participant has its latency.
+        """Lower the priority of this process: all wait for the chain of a simulated step, while a slow participant has a latency.
 
-        Not where it shares its process: a neighbour may be of the chain.
+        Nothing is done if several nodes share the process, as a neighbour may be part of the chain.
         """
         if self.nodes == 1:
             for task in _tasks():
@@ -54,7 +54,7 @@ class Priority:
 
 
 def _tasks() -> set[int]:
-    """Threads of this process by number; one of them may have ended when its number is used."""
+    """Return the ids of this process's threads; a thread may have ended when its id is used."""
     return {int(name) for name in os.listdir("/proc/self/task")}
 
 

@@ -1,9 +1,9 @@
 """The QoS profiles of the graph, by purpose.
 
-Publishers are reliable: a reliable publisher serves best-effort subscribers too. Subscribers to sensors, images and the
-clock are best effort, so that drivers, which publish best effort, are heard as well, and the newest is worth more than
-the complete; those to statuses, results of perception and orders are reliable. What a late subscriber must know (facts,
-the newest map) is transient local; orders are not: a restarted controller must not carry out an old one.
+Publishers are reliable: a reliable publisher serves best-effort subscribers, too. Subscribers to sensors, images and the
+clock are best effort, because drivers publish best effort and the newest message matters more than completeness.
+Subscribers to statuses, results of perception and orders are reliable. What a late subscriber needs (facts, the newest
+map) is transient local; orders are not: a restarted controller must not carry out an old one.
 """
 
 from typing import NamedTuple
@@ -37,5 +37,5 @@ CLOCK = Qos(_profile(10), _profile(10, reliable=False))
 
 
 def kept(purpose: Qos, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
-    """For who keeps every message of a topic: reliable, and with room for seconds of it."""
+    """Return the profile of a subscriber that records every message of a topic, with a queue for seconds of messages."""
     return QoSProfile(depth=2000, reliability=reliability, durability=purpose.publish.durability)

@@ -1,7 +1,7 @@
-"""Ends shared-memory segments that a killed process left unfinished: Fast DDS 2.14 waits without end for their maker.
+"""Removal of shared-memory segments that a killed process left unfinished: Fast DDS 2.14 waits for ever for their creator.
 
-A segment begins with a word of state (`managed_open_or_create_impl` of Boost.Interprocess). Who opens one waits while that word says
-"uninitialized" or "initializing", and goes on without it where it says "corrupted". Making one takes microseconds.
+A segment begins with a state word (`managed_open_or_create_impl` of Boost.Interprocess). A process that opens a segment waits
+while the state is "uninitialized" or "initializing", and continues without it if it is "corrupted". Creation takes microseconds.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from pathlib import Path
 
 FOLDER = Path("/dev/shm")
 PORT = re.compile(r"fast(?:rtps|dds)_port\d+")
-"""Segments that any process may make: in which a participant receives. The others are made before anybody is told of them."""
+"""Names of segments that any process may create: those in which participants receive. Others are announced once complete."""
 INITIALIZED, CORRUPTED = 2, 3
 PATIENCE = 1.0  # after which the maker of an unfinished segment is taken for dead [s]
 
 
 def end_unfinished(folder: Path = FOLDER) -> list[Path]:
-    """Mark unfinished segments as corrupted, so that who waits for them goes on, and remove them.
+    """Mark unfinished segments as corrupted, so that waiting processes continue, and remove them.
 
-    Waits up to `PATIENCE` where one has just been begun, so that nobody waits longer who calls this first.
+    Waits up to `PATIENCE` for a segment that was created just before; a caller that does this first waits no longer than that.
 
     Returns:
-        What was removed.
+        The removed files.
     """
     removed = []
     for file in folder.iterdir() if folder.is_dir() else ():

@@ -1,6 +1,6 @@
-"""Every channel of the graph, once: its message, its QoS, and how a message becomes a value and back.
+"""Table of all channels of the graph: message type, QoS, and conversions from message to value and back.
 
-Adding a topic is adding a row. Ports name channels (`perch_core.component`); hosts look them up here.
+A new topic needs a new row. Ports name channels (`perch_core.component`); hosts look them up here.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ IMAGE_MAX, TRAJECTORY_MAX = 64 << 20, 1 << 20  # bytes; a trajectory of that siz
 
 @dataclass(frozen=True)
 class Topic:
-    """One row.
+    """Row of a topic.
 
     Attributes:
         channel: relative name of the topic; `*` stands for a camera's name.
         message: type of its messages.
         qos: of publishers and subscribers.
         to_message: value to message.
-        to_value: message to value, or to a list of them; raises PerchError where it cannot be one.
-        observed: nobody who flies waits for it.
-        largest: bytes of a message that is read.
-        often: messages per second that are read by one node; 0: all, of which the newest count.
-        pack, unpack: value to serialised message and back without rclpy's objects, for topics of 500 Hz.
+        to_value: message to value, or to a list of values; raises PerchError for a message that cannot be converted.
+        observed: for observers only; no component in flight waits for it.
+        largest: greatest size of a message that is read [bytes].
+        often: greatest number of messages per second that a node reads; 0: no limit.
+        pack, unpack: value to serialised message and back without rclpy's objects, for topics at 500 Hz.
         """
 
     channel: str
@@ -68,10 +68,10 @@ class Topic:
     often: int = 0
 
     def read(self, data: bytes) -> Any:
-        """The value of a serialised message, or a list of them.
+        """Return the value of a serialised message, or a list of values.
 
         Raises:
-            PerchError: it is larger than allowed, or cannot be a value.
+            PerchError: the message is larger than allowed, or cannot be converted.
         """
         if len(data) > self.largest:
             raise PerchError(f"{len(data)} bytes are more than {self.largest}")
@@ -79,7 +79,7 @@ class Topic:
 
     @property
     def latched(self) -> bool:
-        """Whether who comes late gets messages that were published before."""
+        """Whether late subscribers receive messages that were published before."""
         return bool(self.qos.publish.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -128,7 +128,7 @@ def _no_client(_: Any) -> Any:
 
 @dataclass(frozen=True)
 class ServiceRow:
-    """A service: its type; server: request to value, answer to message; client: request to message, answer to value."""
+    """Row of a service: its type; conversions of the server (request to value, answer to message) and the client."""
 
     channel: str
     type: Any
@@ -153,7 +153,7 @@ SERVICES = (
 
 @dataclass(frozen=True)
 class ActionRow:
-    """An action: its type, goal to value, feedback and result to messages, and the result of a goal that is rejected, from the reason."""
+    """Row of an action: its type, goal to value, feedback and result to messages, and the reason of a rejection to a result."""
 
     channel: str
     type: Any
@@ -167,7 +167,7 @@ ACTIONS = (ActionRow("perch", Perch, mission.goal_value, mission.feedback_messag
 
 
 def _rows() -> tuple[Topic, ...]:
-    """All rows; those of TF where its messages are there."""
+    """Return all rows; those of TF only if `tf2_msgs` is installed."""
     if importlib.util.find_spec("tf2_msgs") is None:
         return TOPICS
     from perch_core.ros.messages import transforms
@@ -177,10 +177,10 @@ def _rows() -> tuple[Topic, ...]:
 
 @lru_cache(maxsize=None)
 def topic(channel: str) -> Topic:
-    """The row of a channel.
+    """Return the row of a channel.
 
     Raises:
-        PerchError: there is none.
+        PerchError: there is no such channel.
     """
     parts = channel.split("/")
     for row in _rows():
@@ -191,31 +191,31 @@ def topic(channel: str) -> Topic:
 
 
 def service(channel: str) -> ServiceRow:
-    """The row of a service."""
+    """Return the row of a service."""
     return next(row for row in SERVICES if row.channel == channel)
 
 
 def action(channel: str) -> ActionRow:
-    """The row of an action."""
+    """Return the row of an action."""
     return next(row for row in ACTIONS if row.channel == channel)
 
 
 def message_type(channel: str) -> Any:
-    """Type of a channel's messages."""
+    """Return the message type of a channel."""
     return topic(channel).message
 
 
 def encode(channel: str, value: Any) -> bytes:
-    """A value as a serialised message of its channel."""
+    """Serialise a value as a message of its channel."""
     row = topic(channel)
     return row.pack(value) if row.pack is not None else serialize_message(row.to_message(value))
 
 
 def decode(channel: str, data: bytes) -> Any:
-    """The value of a serialised message; of one with several (`/tf`), the first.
+    """Return the value of a serialised message; the first one if it has several (`/tf`).
 
     Raises:
-        PerchError: the message cannot be a value.
+        PerchError: the message cannot be converted.
     """
     row = topic(channel)
     value = row.read(data)
@@ -230,7 +230,7 @@ _BEGIN = struct.Struct("<iI")  # of a stamp, after four bytes of encapsulation
 
 
 def stamp_of(message: Any, data: bytes) -> int:
-    """Stamp of a serialised message that begins with a header, or is a clock [ns]; 0 for others."""
+    """Return the stamp of a serialised message that begins with a header or is a clock [ns]; 0 for other messages."""
     if message is Clock or "header" in message.get_fields_and_field_types():
         sec, nanosec = _BEGIN.unpack_from(data, 4)
         return int(sec * NANOSECONDS + nanosec)

@@ -1,8 +1,8 @@
-"""What the nodes of one process say to each other, and when it leaves the process.
+"""Communication between the nodes of one process, and publication of their messages to other processes.
 
-rclcpp has intra-process communication, rclpy has not: there a message to a neighbour goes through the middleware, which costs 20 to
-60 us for each reader. Components that share a process get values directly. They are handed on in the order of their emission, each
-handler after the one before; what leaves the process does so when the neighbours have no more to say to each other, so that nobody
+rclpy, unlike rclcpp, has no intra-process communication: a message to a neighbour would go through the middleware, which costs 20
+to 60 us for each reader. Components that share a process receive values directly, in the order of their emission, each handler
+after the previous one. Messages leave the process when all values between neighbours have been handled, so that no neighbour
 waits for the middleware.
 """
 
@@ -24,24 +24,24 @@ Receive = Callable[[Any], None]
 
 
 class Publication:
-    """A topic that leaves the process, where somebody listens."""
+    """A topic that leaves the process if it has subscribers."""
 
     def __init__(self, publisher: Publisher, to_message: Callable[[Any], Any], always: bool, frequent: bool = False,
                  observed: bool = False) -> None:
         """
         Args:
-            publisher: of the topic.
+            publisher: publisher of the topic.
             to_message: value to message, or to a serialised one.
-            always: also where nobody listens: a latched topic keeps its last message for who comes late.
-            frequent: a message comes with every IMU sample; it may wait where a neighbour takes it.
-            observed: nobody who flies waits for it.
+            always: publish also without subscribers: a latched topic keeps its last message for late subscribers.
+            frequent: emitted with every IMU sample; its message may be delayed if a neighbour takes the value.
+            observed: for observers only; no component in flight waits for it.
         """
         self._publisher, self._to_message, self._always = publisher, to_message, always
         self.frequent, self.observed = frequent, observed
         self._heard, self._looked = False, 0.0
 
     def heard(self) -> bool:
-        """Whether anybody outside this process listens, or will want to know."""
+        """Return whether the topic has subscribers, or is published without them."""
         if self._always:
             return True
         now = time.monotonic()
@@ -50,19 +50,19 @@ class Publication:
         return self._heard
 
     def send(self, value: Any) -> None:
-        """Publish a value, where somebody listens."""
+        """Publish a value if `heard`."""
         if self.heard():
             self._publisher.publish(self._to_message(value))
 
 
 class Wiring:
-    """The neighbours of one process. A node that is alone in its process has one of its own.
+    """Connections among the nodes of one process. A single node has a `Wiring` of its own.
 
     Attributes:
         participants: nodes that take part in a lockstep, by name, for a vehicle in this process.
-        schedule_here: that vehicle is there.
-        paced: the process has deadlines and always goes on within milliseconds: what nobody waits for leaves in bundles.
-        progress: tells it that something which it may have waited for has come.
+        schedule_here: whether that vehicle is in this process.
+        paced: the process has deadlines and handles events every few milliseconds; messages without urgency leave in bundles.
+        progress: notifies that vehicle that something for which it may be waiting has arrived.
     """
 
     def __init__(self) -> None:
@@ -82,25 +82,25 @@ class Wiring:
     # -- connecting --------------------------------------------------------------------------------------------------
 
     def writes(self, topic: str, node: str) -> None:
-        """A node of this process publishes a topic."""
+        """Register the node of this process that publishes a topic."""
         self._writers[topic] = node
 
     def writer(self, topic: str) -> str | None:
-        """The node of this process that publishes a topic."""
+        """Return the node of this process that publishes a topic, or None."""
         return self._writers.get(topic)
 
     def add_reader(self, topic: str, receive: Receive) -> None:
-        """Hand every value of a topic that is published in this process to `receive`."""
+        """Pass every value of a topic that is published in this process to `receive`."""
         self._neighbours.setdefault(topic, []).append(receive)
 
     def read_here(self, topic: str) -> bool:
-        """Whether a node of this process takes a topic."""
+        """Return whether a node of this process receives a topic directly."""
         return topic in self._neighbours
 
     # -- working -----------------------------------------------------------------------------------------------------
 
     def emit(self, topic: str, publication: Publication, value: Any) -> None:
-        """A node of this process publishes a value."""
+        """Pass a value of a node of this process to its neighbours, and queue it for publication."""
         neighbours = self._neighbours.get(topic, ())
         for receive in neighbours:
             self._queue.append((receive, (value,)))
@@ -111,7 +111,7 @@ class Wiring:
             self._drain()
 
     def enter(self, work: Callable[..., None], *arguments: Any) -> None:
-        """Do what an event asks for, and all that follows from it in this process; then publish."""
+        """Process an event and everything that follows from it in this process; then publish."""
         self._queue.append((work, arguments))
         if not self._working:
             self._drain()
@@ -132,13 +132,13 @@ class Wiring:
             self._working = False
 
     def run_on(self, executor: Any) -> None:
-        """The executor that runs the nodes' callbacks."""
+        """Set the executor that runs the nodes' callbacks, and give it the work that threads have queued before."""
         self._executor = executor
         while self._early:
             executor.create_task(self.enter, *self._early.popleft())
 
     def from_thread(self, work: Callable[..., None], *arguments: Any) -> None:
-        """Do something on the executor's thread, soon; any thread may call this. What it raises would end the process: it must not."""
+        """Schedule work on the executor's thread; any thread may call this. Work must not raise: that would end the process."""
         if self._executor is None:
             self._early.append((work, *arguments))
         else:
@@ -146,7 +146,7 @@ class Wiring:
 
 
 def foreign_writers(node: Node, topic: str, known: set[str]) -> list[str]:
-    """Fully qualified names of nodes that publish a topic and are not among `known`; a node that is not known by name yet has none."""
+    """Return the fully qualified names, as far as discovered, of nodes that publish a topic and are not in `known`."""
     found = {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in node.get_publishers_info_by_topic(topic)
              if info.node_name != UNNAMED}
     return sorted(name for name in found if name not in known)

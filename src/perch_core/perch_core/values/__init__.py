@@ -1,4 +1,4 @@
-"""Values that cross ports, each with frames, units and shapes. They are immutable: whoever receives one may keep it."""
+"""Values that cross ports, each with frames, units and shapes. They are immutable, so a receiver may keep them."""
 
 from perch_core.values.flight import (
     Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, LawChosen, MotorCommand, RatesThrust,

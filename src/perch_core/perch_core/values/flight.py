@@ -1,4 +1,4 @@
-"""What is flown: trajectories, commands, motor commands, and the controller's answers. Stamps are whole nanoseconds."""
+"""Values of flight control: trajectories, commands and the controller's answers. Stamps are whole nanoseconds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Floats = tuple[float, ...]
 
 
 class AtEnd(IntEnum):
-    """What to do at the end of a trajectory; the values of perch_msgs/Trajectory."""
+    """Action at the end of a trajectory; the values of perch_msgs/Trajectory."""
 
     HOLD = 0
     CONTACT = 1
@@ -25,10 +25,10 @@ class TrajectoryOrder(NamedTuple):
     """A trajectory to fly (channel `trajectory`) or to keep ready (channel `recovery`); fields as in perch_msgs/Trajectory.
 
     Attributes:
-        id: given by whoever orders it.
-        trajectory: its `start_time` is that of a stamp, whole nanoseconds.
-        at_end: what to do at its end.
-        contact_time: how long a contact is awaited after the end [s].
+        id: chosen by the sender.
+        trajectory: its `start_time` is a whole number of nanoseconds, as in a stamp.
+        at_end: action at its end.
+        contact_time: time-out of the wait for a contact after the end [s].
         recovery_start: time at which an appended recovery begins, negative: none [s].
     """
 
@@ -41,7 +41,7 @@ class TrajectoryOrder(NamedTuple):
     @classmethod
     def of(cls, id: int, trajectory: FlatTrajectory | SampledTrajectory, at_end: AtEnd = AtEnd.HOLD, contact_time: float = 0.0,
            recovery_start: float = -1.0) -> TrajectoryOrder:
-        """An order whose start is rounded to the nanosecond that a message can carry."""
+        """Return an order whose start is rounded to whole nanoseconds, the resolution of a message."""
         start = seconds(nanoseconds(trajectory.start_time))
         if start != trajectory.start_time:
             trajectory = replace(trajectory, start_time=start)
@@ -49,14 +49,14 @@ class TrajectoryOrder(NamedTuple):
 
     @property
     def contact_after(self) -> float | None:
-        """From its start to the planned contact [s]; None: it plans none."""
+        """Time from the start to the planned contact [s]; None: no contact is planned."""
         if self.at_end not in (AtEnd.CONTACT, AtEnd.RECOVER):
             return None
         return self.recovery_start if self.recovery_start > 0.0 else self.trajectory.duration
 
 
 class ControllerCommand(NamedTuple):
-    """What the controller shall do apart from trajectories; `command` and fields as in perch_msgs/ControllerCommand."""
+    """A command to the controller other than a trajectory; `command` and fields as in perch_msgs/ControllerCommand."""
 
     stamp: int
     command: int
@@ -72,7 +72,7 @@ class MotorCommand(NamedTuple):
 
 
 class RatesThrust(NamedTuple):
-    """Body rates [rad/s], 3 floats, and collective thrust / mass [m/s^2] for an inner rate loop, for the step with this stamp [ns]."""
+    """Body rates [rad/s], 3 floats, and collective thrust / mass [m/s^2] for an inner rate loop; stamp of the step [ns]."""
 
     stamp: int
     armed: bool
@@ -81,8 +81,8 @@ class RatesThrust(NamedTuple):
 
 
 class AttitudeThrust(NamedTuple):
-    """Attitude xyzw, 4 floats, body rates to feed forward [rad/s], 3 floats, and collective thrust / mass [m/s^2] for an inner attitude
-    loop, for the step with this stamp [ns]."""
+    """Attitude xyzw, 4 floats, feed-forward body rates [rad/s], 3 floats, and collective thrust / mass [m/s^2] for an inner
+    attitude loop at the step with this stamp [ns]."""
 
     stamp: int
     armed: bool
@@ -108,7 +108,7 @@ class ControllerStatus(NamedTuple):
 
 
 class ControlReference(NamedTuple):
-    """What the controller wanted at a step; fields as in perch_msgs/ControlReference, vectors as tuples of floats."""
+    """Reference of the controller at a step; fields as in perch_msgs/ControlReference, vectors as tuples of floats."""
 
     stamp: int
     trajectory_id: int
@@ -123,7 +123,7 @@ class ControlReference(NamedTuple):
 
 
 class ChooseLaw(NamedTuple):
-    """Request of `set_controller`: the law, with or without L1."""
+    """Request of `set_controller`: the control law, with or without L1 adaptation."""
 
     type: str
     adaptive: bool
@@ -142,7 +142,7 @@ class Ask(NamedTuple):
 
 
 class Done(NamedTuple):
-    """The answer to it."""
+    """Answer to `Ask`."""
 
     success: bool
     message: str

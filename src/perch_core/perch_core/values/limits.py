@@ -1,8 +1,8 @@
-"""What may enter: sizes, counts and magnitudes of every value, declared once, and the one form in which the rest is refused.
+"""Limits of values that enter components: sizes, counts and magnitudes, and the format in which other values are refused.
 
-The bounds lie far outside what any vehicle here measures or flies, so that what is beyond them is nonsense whoever takes it: a component
-refuses it at its door (`perch_core.component`), a planner answers BAD_INPUT, the mission BAD_GOAL. What depends on the present (stamps,
-frames, where the vehicle is) or on a vehicle is judged by who knows that. docs/limits.md is generated from this file.
+The bounds lie far outside what any supported vehicle measures or flies, so values beyond them are invalid for every receiver: a
+component refuses them on input (`perch_core.component`), a planner answers BAD_INPUT, the mission BAD_GOAL. What depends on the
+current state (stamps, frames, position) or on the vehicle is checked by the receiver. docs/limits.md is generated from this file.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class Limit:
     Attributes:
         low, high: inclusive.
         unit: of the values.
-        shape: of the array, () a number; -1: any number, of rows up to `most`.
-        most: rows.
-        optional: NaN leaves the value to whoever takes it.
+        shape: shape of the array; (): a number; -1: any size, along the first axis up to `most`.
+        most: greatest number of rows.
+        optional: NaN is allowed and leaves the choice to the receiver.
     """
 
     low: float
@@ -48,7 +48,7 @@ class Limit:
     optional: bool = False
 
     def problem(self, value: Any) -> str:
-        """Why a value is refused; empty: it is not."""
+        """Return why a value is refused; empty: it is valid."""
         try:
             array = np.asarray(value, float)
         except (TypeError, ValueError, OverflowError):
@@ -73,12 +73,12 @@ class Limit:
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit quaternion, but for rounding."""
+    """A unit quaternion, within a tolerance for rounding."""
 
     tolerance: float = 1e-3
 
     def problem(self, value: Any) -> str:
-        """Why a value is refused; empty: it is not."""
+        """Return why a value is refused; empty: it is valid."""
         norm = float(np.sqrt(sum(float(x) * float(x) for x in value)))
         return "" if len(value) == 4 and abs(norm - 1.0) <= self.tolerance else f"norm {norm:.4f} is not 1"
 
@@ -88,10 +88,10 @@ class Unit:
 
 @dataclass(frozen=True)
 class Covariance:
-    """A covariance matrix; `certain`: symmetric and without negative eigenvalues, otherwise its variances alone are looked at.
+    """A covariance matrix; `certain`: symmetric and positive semi-definite; otherwise only its variances are checked.
 
     Attributes:
-        absent: a negative first entry says that there is none.
+        absent: a negative first entry is allowed and means that there is no covariance.
     """
 
     size: int
@@ -99,7 +99,7 @@ class Covariance:
     absent: bool = False
 
     def problem(self, value: Any) -> str:
-        """Why a value is refused; empty: it is not."""
+        """Return why a value is refused; empty: it is valid."""
         C = np.asarray(value, float)
         if C.size != self.size**2:
             return f"{C.size} entries are not {self.size} x {self.size}"
@@ -122,12 +122,12 @@ class Covariance:
 
 @dataclass(frozen=True)
 class Text:
-    """Text of up to so many characters."""
+    """Text of up to `most` characters."""
 
     most: int
 
     def problem(self, value: Any) -> str:
-        """Why a value is refused; empty: it is not."""
+        """Return why a value is refused; empty: it is valid."""
         return "" if len(value) <= self.most else f"{value[:_SHOWN]!r}...: {len(value)} characters are more than {self.most}"
 
     def __str__(self) -> str:
@@ -142,7 +142,7 @@ class Each:
     most: int
 
     def problem(self, value: Any) -> str:
-        """Why a value is refused; empty: it is not."""
+        """Return why a value is refused; empty: it is valid."""
         if len(value) > self.most:
             return f"{len(value)} entries are more than {self.most}"
         return next((f"[{k}].{said}" for k, one in enumerate(value) if (said := problem(one))), "")
@@ -153,12 +153,12 @@ class Each:
 
 @dataclass(frozen=True)
 class Part:
-    """A value of another type, within that type's limits; None: left out."""
+    """A value of another type, within that type's limits; None is allowed."""
 
     kinds: tuple[type, ...]
 
     def problem(self, value: Any) -> str:
-        """Why a value is refused; empty: it is not."""
+        """Return why a value is refused; empty: it is valid."""
         return "" if value is None else problem(value)
 
     def __str__(self) -> str:
@@ -245,18 +245,18 @@ LIMITS: dict[type, dict[str, Any]] = {
         "lines": Each(MappedPowerline, PLAN_LINES_MAX), "target_line": ID, "perch_point": POSITION, "perch_pitch": Limit(0.0, pi + 1e-9, "rad"),
         "end_velocity": VELOCITY, "deadline": Limit(0.0, 1e12, "s")},
 }
-"""Type of a value -> field -> what it may be; None is left to whoever takes it."""
+"""Limits by type of value and field; fields that are None are not checked."""
 
 STATE = {name: LIMITS[PerchPlanRequest][name] for name in ("p", "v", "a", "j", "yaw", "yaw_rate")}
 CURRENT = {"durations": Limit(1e-3, PLAN_LONGEST, "s", (-1,), PLAN_SEGMENTS_MAX), "degree": Limit(0, DEGREE_MAX),
            "coefficients": _coefficients(PLAN_SEGMENTS_MAX)}
-"""Of `PerchPlanRequest.current`, whose state at the start is limited as one that is given."""
+"""Limits of `PerchPlanRequest.current`; its state at `start` must be within `STATE`."""
 POSE: dict[str, Limit | Unit] = {"position": POSITION, "orientation": Unit(1e-2)}
-"""Of `PowerlinePlanRequest.perch_pose`."""
+"""Limits of `PowerlinePlanRequest.perch_pose`."""
 
 
 def problem(value: Any) -> str:
-    """Why a value is nonsense: `field: value why`; empty: it is not, or nothing is declared for its type. Runs at every IMU sample."""
+    """Return why a value is invalid, as `field: reason`; empty: valid, or no limits for its type. Runs at every IMU sample."""
     kind = type(value)
     try:
         if kind in _QUICK and _QUICK[kind](value):
@@ -270,15 +270,15 @@ def problem(value: Any) -> str:
 
 
 def check(source: str, values: Any, limits: dict[str, Any] | None = None) -> None:
-    """Refuse nonsense.
+    """Check a value against its limits.
 
     Args:
         source: for messages.
-        values: an object with an attribute for each limit.
-        limits: name -> limit; None: those of its type.
+        values: an object with one attribute per limit.
+        limits: name -> limit; None: the limits of the type of `values`.
 
     Raises:
-        ConfigError: names the field, its value and what is allowed.
+        ConfigError: a field is invalid; names the field, its value and what is allowed.
     """
     for name, limit in (LIMITS[type(values)] if limits is None else limits).items():
         value = getattr(values, name)
@@ -287,7 +287,7 @@ def check(source: str, values: Any, limits: dict[str, Any] | None = None) -> Non
 
 
 def stamp_of(request: Any) -> int:
-    """The start of a request as a stamp for diagnostics [ns], 0 where it is none."""
+    """Return the start of a request as a stamp for diagnostics [ns], 0 if it is not a valid stamp."""
     return 0 if STAMP.problem(request.start) else int(request.start)
 
 
@@ -317,4 +317,4 @@ def _variances(covariance: np.ndarray) -> bool:
 
 
 _QUICK: dict[type, Callable[[Any], bool]] = {ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motors}
-"""Shorter ways to the answer that all is well, a microsecond or two each."""
+"""Fast checks, 1 to 2 us each, by type; where one does not accept a value, `LIMITS` decides."""

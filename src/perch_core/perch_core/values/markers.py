@@ -1,4 +1,4 @@
-"""Markers: simple shapes in `map`, as rviz and Foxglove draw them; fields as in visualization_msgs/Marker. Stamps are whole nanoseconds."""
+"""Markers: simple shapes in `map` for RViz and Foxglove; fields as in visualization_msgs/Marker. Stamps are whole nanoseconds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Floats = tuple[float, ...]
 
 
 class Shape(IntEnum):
-    """The values of visualization_msgs/Marker."""
+    """Shape of a marker; the values of visualization_msgs/Marker."""
 
     ARROW = 0
     CUBE = 1
@@ -23,17 +23,17 @@ class Shape(IntEnum):
 
 @dataclass(frozen=True)
 class Marker:
-    """One shape at a pose in `map`; `ns` and `id` name it, so that a later one replaces it.
+    """One shape at a pose in `map`; it replaces an earlier marker with the same `ns` and `id`.
 
     Attributes:
-        shape: what is drawn.
-        ns, id: its name.
+        shape: shape to draw.
+        ns, id: identify the marker.
         colour: red, green, blue, opacity, 0 to 1.
-        scale: size [m], 3 floats; of lines the width first, of texts the height last.
+        scale: size [m], 3 floats; the first is the width of lines, the last the height of texts.
         p, q: position [m], 3 floats, and attitude xyzw, 4 floats.
         points: of lines and arrows [m], 3 floats each.
         text: of texts.
-        removed: it is drawn no longer.
+        removed: the marker is to be deleted.
     """
 
     shape: Shape

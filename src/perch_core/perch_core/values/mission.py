@@ -11,7 +11,7 @@ Floats = tuple[float, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class PerchGoal:
-    """Goal of the action `perch`; fields as in perch_msgs/action/Perch, NaN where they are left to the mission's parameters.
+    """Goal of the action `perch`; fields as in perch_msgs/action/Perch, NaN: the mission's parameters apply.
 
     Attributes:
         mode: 0 surface, 1 powerline, 2 inspection.
@@ -33,7 +33,7 @@ class PerchGoal:
 
 
 class PerchFeedback(NamedTuple):
-    """How a goal goes: phase, share of it, predicted time to contact [s] (NaN: not on the way), words."""
+    """Progress of a goal: phase, share of the phase, predicted time to contact [s] (NaN: not on the way), message."""
 
     phase: str
     progress: float
@@ -42,7 +42,7 @@ class PerchFeedback(NamedTuple):
 
 
 class PerchResult(NamedTuple):
-    """How a goal ended; `error_code` as in perch_msgs/action/Perch, times [s], final pose estimated in W."""
+    """Result of a goal; `error_code` as in perch_msgs/action/Perch, times [s], final pose estimated in W."""
 
     success: bool
     error_code: int

@@ -1,4 +1,4 @@
-"""What is found to perch on: the pad, the powerlines. Stamps are whole nanoseconds, quaternions xyzw."""
+"""Targets found by perception: the pad and the powerlines. Stamps are whole nanoseconds, quaternions xyzw."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class TargetPose(NamedTuple):
         stamp: middle of the last image's exposure on the IMU's clock [ns].
         p_WS: position [m], shape (3,).
         q_WS: attitude, shape (4,).
-        covariance: of (position, rotation) in the axes of W relative to the vehicle at the stamp [m, rad], shape (6, 6): the odometry's own
-            error there moves vehicle and target alike and is not in it.
+        covariance: of (position, rotation) in the axes of W relative to the vehicle at the stamp [m, rad], shape (6, 6); the
+            odometry's error at the stamp displaces vehicle and target equally and is not included.
     """
 
     stamp: int
@@ -27,16 +27,16 @@ class TargetPose(NamedTuple):
 
 
 class TargetSighting(NamedTuple):
-    """What one image showed of the target; fields as in perch_msgs/TargetDetection.
+    """Detection of the target in one image; fields as in perch_msgs/TargetDetection.
 
     Attributes:
         stamp: middle of the exposure [ns].
-        found: a usable pose in W.
-        pose: of S in W; None: none.
-        pose_camera: of S in the camera's optical frame; None: no tag was found.
+        found: whether there is a usable pose in W.
+        pose: pose of S in W; None: no usable pose.
+        pose_camera: pose of S in the camera's optical frame; None: no tag was found.
         ids: tags used.
         reprojection_rms: of the corners [px].
-        frames_fused: images that `pose` rests on.
+        frames_fused: number of images on which `pose` is based.
         method: joint, average or fused.
         message: why nothing was found, for people.
     """
@@ -56,12 +56,12 @@ class MappedPowerline(NamedTuple):
     """One straight segment of the map; fields as in perch_msgs/Powerline.
 
     Attributes:
-        id: number under which the map knows it.
+        id: number of the segment in the map.
         start, end: in W [m], 3 floats each.
         radius: of the wire [m].
         covariance: of the segment's closest point to its mean [m^2], shape (3, 3).
         direction_sigma: 1 sigma of the direction [rad].
-        observations: images that support it.
+        observations: number of images that support the segment.
     """
 
     id: int
@@ -74,22 +74,22 @@ class MappedPowerline(NamedTuple):
 
     @property
     def segment(self) -> Segment:
-        """Its geometry.
+        """Geometry of the segment.
 
         Raises:
-            PerchError: not finite, without length or radius.
+            PerchError: it is not finite, or its length or radius is not positive.
         """
         return Segment.between(np.array(self.start), np.array(self.end), self.radius, self.id)
 
 
 class PowerlineMap(NamedTuple):
-    """All that is known of the powerlines.
+    """Map of all detected powerlines.
 
     Attributes:
         stamp: middle of the last image's exposure [ns].
         lines: segments.
-        degenerate: the motion so far does not determine some line.
-        message: what is missing, for people.
+        degenerate: whether some line is not determined by the motion so far.
+        message: missing information, for people.
     """
 
     stamp: int

@@ -10,7 +10,7 @@ from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values.perching import MappedPowerline
 
 OPTIONS = ("impact_acceleration", "impact_speed_min", "impact_speed_max", "thrust_max", "thrust_min")
-"""Fields of `PerchPlanRequest` that are None where they are left to the planner."""
+"""Optional fields of `PerchPlanRequest`; None: the planner's setting applies."""
 
 
 def _zero() -> np.ndarray:
@@ -27,8 +27,8 @@ class Certificate:
         lower_limit, upper_limit: required bounds, infinite where there is none.
         minimum, maximum: bounds of the quantity, infinite where none was asked for.
         time_of_minimum, time_of_maximum: times of the samples nearest to them [s]; nan: none.
-        method: bernstein, sturm, interval: the bounds are proved; dense: they are those of samples, and no proof.
-        holds: the limits are kept.
+        method: bernstein, sturm, interval: the bounds are proved; dense: they are extremes of samples, without proof.
+        holds: whether the limits are kept.
     """
 
     quantity: str
@@ -55,7 +55,7 @@ class Certificate:
 
 @dataclass(frozen=True, kw_only=True)
 class PerchPlanRequest:
-    """Request of `plan_perch` and `plan_way_out`; fields as in perch_msgs/srv/PlanPerch, whose options are None where they are left to the planner.
+    """Request of `plan_perch` and `plan_way_out`; fields as in perch_msgs/srv/PlanPerch, with None for NaN options.
 
     Attributes:
         start: stamp of the trajectory's start [ns].
@@ -65,9 +65,9 @@ class PerchPlanRequest:
         p_WS, q_WS: pose of the surface at `start`, shapes (3,) and (4,).
         target_velocity: [m/s], shape (3,).
         waypoints: positions to pass [m], shape (k, 3).
-        segment_times: first guess [s]; empty: the planner's.
+        segment_times: initial guess [s]; empty: the planner's.
         impact_acceleration, impact_speed_min, impact_speed_max, thrust_max, thrust_min: [m/s^2], [m/s], [N]; None: the planner's.
-        thrust_ratio: thrust that the rotors give, over the vehicle file's; 0: as in the file.
+        thrust_ratio: actual thrust of the rotors over that of the vehicle file; 0: as in the file.
         objective: 0 the planner's, 4 snap, 3 jerk.
         minimum_time: shorten the plan until a bound is active.
     """
@@ -104,10 +104,10 @@ class PerchPlan:
         error_code: as in the service.
         message: what failed, by how much, and what to change.
         trajectory: from the request's start to the contact; None without success.
-        contact_time: how long the contact is awaited after the end [s]; 0: of a way out, which ends in a hover.
+        contact_time: time-out of the wait for contact after the end [s]; 0 for a way out, which ends in a hover.
         certificates: every bound with its proof.
-        iterations: QPs solved.
-        solve_time: wall-clock time [s]; it tells nothing of the plan, and nothing may depend on it.
+        iterations: number of QPs solved.
+        solve_time: wall-clock time [s]; it varies between runs, and no decision may depend on it.
     """
 
     success: bool
@@ -130,12 +130,12 @@ class PowerlinePlanRequest:
         rotor_thrust: [N], 4 values, or empty: hover.
         lines: all segments to avoid, the target among them.
         target_line: id of the segment to perch on.
-        perch_pose: (position [m], attitude) where to end; None: by `perch_point` and `perch_pitch`.
+        perch_pose: final pose (position [m], attitude); None: from `perch_point` and `perch_pitch`.
         perch_point: on the line [m], shape (3,).
         perch_pitch: tilt of b3 from the vertical about the line [rad].
         end_velocity: [m/s], shape (3,).
         perception_aware, with_recovery, recovery_only: as in the service.
-        deadline: wall-clock limit from the request on [s], no more than 10 s of it count; 0: the planner's.
+        deadline: wall-clock limit from the request on [s], at most 10 s; 0: the planner's.
     """
 
     start: int

@@ -1,4 +1,4 @@
-"""What sensors give: IMU samples, images, camera models, transforms. Stamps are whole nanoseconds."""
+"""Sensor data: IMU samples, images, camera models, transforms. Stamps are whole nanoseconds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class ImuSample(NamedTuple):
         stamp: [ns].
         w_B: angular velocity [rad/s], 3 floats.
         f_B: specific force [m/s^2], 3 floats.
-        frame: whose axes both are in; the nodes turn what is not in those of `imu_link` = B.
+        frame: frame of both vectors; nodes rotate samples of frames other than `imu_link` into B.
     """
 
     stamp: int
@@ -27,14 +27,14 @@ class ImuSample(NamedTuple):
 
 
 class CameraImage:
-    """One image, drawn or decoded when it is looked at.
+    """One image; it may be rendered only when its pixels are read.
 
     Attributes:
-        stamp: the board's: middle of the exposure plus the camera's stamp offset [ns].
+        stamp: stamp of the camera board: middle of the exposure plus the camera's stamp offset [ns].
         frame: optical frame.
         width, height: [px].
         encoding: mono8, rgb8 or bgr8.
-        ready: whether `pixels` returns at once; None: always. An image that is being drawn elsewhere is waited for by whoever schedules.
+        ready: reports whether `pixels` returns at once; None: always. The scheduler waits until an image is rendered.
     """
 
     __slots__ = ("stamp", "frame", "width", "height", "encoding", "_pixels", "ready")
@@ -44,17 +44,17 @@ class CameraImage:
         """
         Args:
             stamp, frame, width, height, encoding: as above.
-            pixels: the image, uint8 (height, width) or (height, width, 3); or a function of a region (or None) that draws it.
-            ready: whether it has been drawn, `ready(timeout)` with a wait of at most `timeout` [s].
+            pixels: the image, uint8 (height, width) or (height, width, 3); or a function of a region (or None) that renders it.
+            ready: `ready(timeout)` waits at most `timeout` [s] and reports whether the image has been rendered.
         """
         self.stamp, self.frame, self.width, self.height, self.encoding = stamp, frame, width, height, encoding
         self._pixels, self.ready = pixels, ready
 
     def pixels(self, region: Region | None = None) -> np.ndarray | None:
-        """The image, uint8, (height, width) or (height, width, 3) by the encoding; None: whoever draws has ended.
+        """The image, uint8, (height, width) or (height, width, 3) by the encoding; None: the renderer has ended.
 
         Args:
-            region: rows and columns that matter to who asks first; the rest need not be drawn. None: all of it.
+            region: rows and columns that the first caller needs; others need not be rendered. None: the whole image.
         """
         if callable(self._pixels):
             return self._pixels(region)
@@ -62,7 +62,7 @@ class CameraImage:
 
 
 class CameraModel(NamedTuple):
-    """Intrinsics of a camera, as `camera_info` gives them: with every frame, of the frame's stamp [ns]."""
+    """Intrinsics of a camera, as in `camera_info`: published with every image, with the image's stamp [ns]."""
 
     stamp: int
     frame: str
@@ -70,7 +70,7 @@ class CameraModel(NamedTuple):
 
 
 class Transform(NamedTuple):
-    """Where a frame is in another: `p` position of the child's origin in the parent [m], `q` attitude xyzw."""
+    """Pose of a frame in another: `p` position of the child's origin in the parent [m], `q` attitude xyzw."""
 
     parent: str
     child: str
@@ -79,7 +79,7 @@ class Transform(NamedTuple):
 
 
 class StampedTransform(NamedTuple):
-    """Where a frame is in another at a stamp [ns]; the rest as in `Transform`."""
+    """Pose of a frame in another at a stamp [ns]; other fields as in `Transform`."""
 
     stamp: int
     parent: str
@@ -92,7 +92,7 @@ class CompressedPixels(NamedTuple):
     """An image in a compressed form.
 
     Attributes:
-        stamp: of the image that it was made from [ns].
+        stamp: stamp of the source image [ns].
         frame: optical frame.
         format: jpeg or png.
         data: the compressed image.
@@ -105,7 +105,7 @@ class CompressedPixels(NamedTuple):
 
 
 class Serialized(NamedTuple):
-    """A message of any topic as it is on the wire, for components that pass messages on or keep them.
+    """A serialised message of any topic, for components that forward or record messages.
 
     Attributes:
         topic: fully resolved name.

@@ -1,4 +1,4 @@
-"""Stamps: whole nanoseconds, exact, and the same as seconds to the last bit wherever they are read."""
+"""Stamps in whole nanoseconds, and their conversion to seconds, which is the same to the last bit everywhere."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def seconds(stamp: int) -> float: ...
 @overload
 def seconds(stamp: np.ndarray) -> np.ndarray: ...
 def seconds(stamp: int | np.ndarray) -> float | np.ndarray:
-    """Nanoseconds in seconds."""
+    """Convert nanoseconds to seconds."""
     return stamp // NANOSECONDS + 1e-9 * (stamp % NANOSECONDS)
 
 
 def nanoseconds(time: float) -> int:
-    """Seconds in whole nanoseconds."""
+    """Convert seconds to whole nanoseconds."""
     return round(time * NANOSECONDS)

@@ -1,1 +1,1 @@
-"""Section IV-C of paper M as it is printed, to be read beside it. What flies is `perch_planner.planner`."""
+"""Section IV-C of paper M as printed, for comparison with the text. The shipped planner is `perch_planner.planner`."""

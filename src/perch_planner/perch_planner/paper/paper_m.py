@@ -1,16 +1,16 @@
-"""Planning for aggressive perching, as section IV-C of paper M has it: solve a QP, check the thrust, give it more time.
+"""Planning for aggressive perching as in section IV-C of paper M: solve a QP, check the thrust, lengthen the durations.
 
-This is the paper, to be read beside it; it does not fly. `perch_planner.planner` plans the same perches with cuts, in a
-smaller program, and keeps every limit. Where the printed text cannot be used as it stands, the lines here differ from it:
+This module serves comparison with the text. The shipped planner, `perch_planner.planner`, plans the same perches with cuts,
+in a smaller program, and keeps every limit. Where the printed text cannot be used as it stands, the code differs from it:
 
-* each polynomial is written in Bernstein's basis on its own segment instead of powers of t: with those no solver meets
+* each polynomial is written in the Bernstein basis on its own segment instead of powers of t: with powers no solver meets
   the end conditions;
 * the tube [M:eq15] is sorted, as the printed inequality swaps its bounds where a component is negative, and keeps a least
   half width, as it closes where a component is zero;
 * s3 is the *outward* normal, so the speed of impact [M:eq14] is -v . s3;
-* Algorithm 1 is asked about the least thrust, too, with the signs turned;
-* "adding time to violating segments" ends in 17 of 24 problems with waypoints (those of Table I), and in none of 12 with
-  factor 1.1, as their neighbours keep the speed up; so these grow, too, and it ended in all of 20 tried.
+* Algorithm 1 also checks the least thrust, with reversed signs;
+* "adding time to violating segments" terminates in 17 of 24 problems with waypoints (those of Table I), and in none of 12
+  with factor 1.1, as their neighbours keep the speed high; the neighbours therefore grow too, which terminates in all 20 tried.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _DERIVATIVES = tuple(bernstein.derivative(np.eye(N + 1), order) for order in ran
 
 
 def row(order: int, s: float, duration: float) -> np.ndarray:
-    """The order-th derivative of the basis at t - t_(i-1) = s duration, shape (15,): times c_id it is that of p_id. [M:eq6, M:eq17]"""
+    """Order-th derivative of the basis at t - t_(i-1) = s duration, (15,); times c_id it is that of p_id. [M:eq6, M:eq17]"""
     derivative: np.ndarray = _DERIVATIVES[order] @ bernstein.basis(N - order, s) / duration**order
     return derivative
 
@@ -60,18 +60,18 @@ def _unit_cost(j: int) -> np.ndarray:
 
 
 def place(vector: np.ndarray, segment: int, f: int) -> np.ndarray:
-    """A row for one segment among the coefficients of all, shape (15 f,)."""
+    """Embed a row of one segment in the coefficients of all segments, shape (15 f,)."""
     out = np.zeros((f, N + 1))
     out[segment] = vector
     return out.ravel()
 
 
 def equalities(durations: np.ndarray, knots: Sequence[dict[int, Any]]) -> tuple[np.ndarray, np.ndarray]:
-    """A_d and b_d of all dimensions: what is imposed at the knots [M:eq6], and continuity there. [M:eq7]
+    """A_d and b_d of all dimensions: imposed derivatives at the knots [M:eq6], and continuity there. [M:eq7]
 
     Args:
         durations: of the segments [s], shape (f,).
-        knots: for each of t_0 ... t_f the derivatives that are imposed, order -> value of each dimension.
+        knots: for each of t_0 ... t_f the imposed derivatives, order -> value of each dimension.
 
     Returns:
         A, shape (r, 15 f), the same for every dimension, and b, shape (r, dimensions).
@@ -156,7 +156,7 @@ def program(durations: np.ndarray, knots: Sequence[dict[int, Any]], j: int,
     Args:
         durations, knots: as for `equalities`.
         j: order of the derivative in the cost, 4 snap or 3 jerk.
-        bounds: of `inequalities`; None: there are none.
+        bounds: from `inequalities`; None: no inequalities.
     """
     f, n = len(durations), N + 1
     Q = np.zeros((n * f, n * f))
@@ -189,7 +189,7 @@ def position_program(problem: PerchProblem, settings: PerchSettings, vehicle: Ve
 
 
 def yaw_coefficients(problem: PerchProblem, settings: PerchSettings, durations: np.ndarray) -> np.ndarray:
-    """The QP of the heading, d = 4, at rest in the end with b2_des parallel to s2, shape (f, 15) [rad]. [M:eq8, M:eq12]"""
+    """Solve the QP of the heading, d = 4, at rest at the end with b2_des parallel to s2, shape (f, 15) [rad]. [M:eq8, M:eq12]"""
     start, end = problem.start, contact_heading(problem.surface)
     turn = start.yaw + (end - start.yaw + np.pi) % (2.0 * np.pi) - np.pi
     knots = [{0: start.yaw, 1: start.yaw_rate, 2: start.yaw_acc}, *({} for _ in problem.waypoints), {0: turn, 1: 0.0, 2: 0.0}]
@@ -204,14 +204,14 @@ def squared_thrust(coefficients: np.ndarray, duration: float, mass: float) -> np
 
 
 def keeps_thrust(coefficients: np.ndarray, duration: float, mass: float, low: float, high: float) -> bool:
-    """tau_min^2 <= H <= tau_max^2 on a segment, by Algorithm 1. [M:eq16, M:alg1]"""
+    """Check tau_min^2 <= H <= tau_max^2 on a segment by Algorithm 1. [M:eq16, M:alg1]"""
     H = squared_thrust(coefficients, duration, mass)
     return bool(sturm.global_bound_check(H / high**2, 1.0, 0.0, 1.0) and sturm.global_bound_check(-H / low**2, -1.0, 0.0, 1.0))
 
 
 class Iteration(NamedTuple):
-    """One QP; Bernstein coefficients of x, y, z, shape (f, 3, 15) [m], None where it has no solution; segments whose thrust leaves
-    its bounds, shape (f,).
+    """One QP: its Bernstein coefficients of x, y, z, shape (f, 3, 15) [m], None without a solution; flags of the segments whose
+    thrust leaves its bounds, shape (f,).
     """
 
     program: Program
@@ -220,12 +220,12 @@ class Iteration(NamedTuple):
 
 
 class PaperPlan(NamedTuple):
-    """Where the procedure ended.
+    """Result of the procedure.
 
     Attributes:
-        iterations: in order; the last one is the plan.
+        iterations: in order; where `solved`, the last one is the plan.
         trajectory: P_d(t), d = 1 ... 4, [M:eq3]; None where there is none.
-        solved: it keeps the thrust bounds. [M:eq16]
+        solved: the plan keeps the thrust bounds. [M:eq16]
         solve_time: CPU time [s].
     """
 
@@ -236,11 +236,11 @@ class PaperPlan(NamedTuple):
 
 
 def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> PaperPlan:
-    """Solve the QP, check the thrust of each segment, lengthen those that violate it and their neighbours, and again. [M:IV-C.3]
+    """Solve the QP, check the thrust of each segment, lengthen violating segments and their neighbours, and repeat. [M:IV-C.3]
 
     Args:
-        problem: with `segment_times`, the durations to begin with; its pad stands still.
-        settings: alpha, v_min, v_max, tube, thrust bounds, objective and `duration_max`; others do not count.
+        problem: with `segment_times`, the initial durations, and a static target.
+        settings: alpha, v_min, v_max, tube, thrust bounds, objective, solver and `duration_max`; others are ignored.
         vehicle: mass, thrust range and perch offset.
     """
     begin = process_time()

@@ -1,7 +1,7 @@
-"""Algorithm 1 as the paper has it: global bound checking by Sturm's chain.
+"""Algorithm 1 as printed in the paper: global bound checking by Sturm's chain.
 
 The chain of a polynomial of degree 24 is ill-conditioned in floating point: at a relative margin of 1e-6 it accepts
-70 of 600 polynomials that violate their bound. `perch_planner.bounds` decides what flies.
+70 of 600 polynomials that violate their bound. The shipped planner uses `perch_planner.bounds` instead.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _sign_changes(chain: Array, degrees: np.ndarray, x: float) -> int:
 def count_roots(powers: Array, low: float, high: float) -> int:
     """STURM(F, t_0, t_f): number of distinct roots in (low, high]. [M:eq18]
 
-    The appendix' example t^4 + t^3 - t - 1 has one in (0, 2]. [defines M:eq19]
+    The example of the appendix, t^4 + t^3 - t - 1, has one in (0, 2]. [defines M:eq19]
     """
     chain, degrees = sturm_chain(powers)
     return _sign_changes(chain, degrees, low) - _sign_changes(chain, degrees, high)

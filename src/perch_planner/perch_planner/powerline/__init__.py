@@ -1,7 +1,7 @@
 """Perches on powerlines by nonlinear programming: plan, check, recover. [P:V]
 
-`PowerlinePlanner` plans, `service` turns requests and plans into values of its service and back; `problem` reads files, `report` writes
-what came out.
+`PowerlinePlanner` plans; `service` converts requests and plans from and to the values of the service; `problem` reads files;
+`report` writes results.
 """
 
 from perch_planner.powerline.plan import Manoeuvre, PowerlinePlan

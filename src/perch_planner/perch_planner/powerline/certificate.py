@@ -1,4 +1,4 @@
-"""Checks of a flown plan: clearance, height, thrust, thrust rate and body rate between the nodes, errors at the end."""
+"""Checks of a simulated plan: clearance, height, thrust, thrust rate and body rate between the nodes, errors at the end."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def _certificate(quantity: str, unit: str, times: np.ndarray, values: np.ndarray
 
 def certify(vehicle: Vehicle, times: np.ndarray, states: np.ndarray, rates: np.ndarray, lines: Sequence[Segment],
             height_min: float, thrust_max: float) -> tuple[Certificate, ...]:
-    """Certificates of everything that must hold on the way.
+    """Certificates of all limits along a trajectory.
 
     Args:
         vehicle: limits and body.
         times: [s], shape (m,).
         states: shape (m, 17).
         rates: thrust rates [N/s], shape (m, 4).
-        lines: every known segment, as thick as it counts.
+        lines: every known segment, with the radius to be kept clear.
         height_min: [m].
         thrust_max: greatest rotor thrust that the plan may use [N].
 
@@ -56,7 +56,7 @@ def certify(vehicle: Vehicle, times: np.ndarray, states: np.ndarray, rates: np.n
 
 def certify_end(times: np.ndarray, states: np.ndarray, perch: PerchPose, position: float, tilt_deg: float, speed: float
                 ) -> tuple[Certificate, ...]:
-    """Errors of the last state against the wanted pose.
+    """Certificates of the errors of the last state against the wanted pose.
 
     Args:
         times, states: as in `certify`.

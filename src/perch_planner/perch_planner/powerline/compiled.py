@@ -22,7 +22,7 @@ def _source(functions: dict[str, ca.Function]) -> str:
 
 
 def load(stages: StageFunctions) -> tuple[StageFunctions, bool]:
-    """Stage functions with compiled bodies, or as they are where there is no compiler or PERCH_COMPILE is 0.
+    """Stage functions with compiled bodies, or unchanged where there is no compiler or PERCH_COMPILE is 0.
 
     Interpreted they are about five times slower, with the same results.
 

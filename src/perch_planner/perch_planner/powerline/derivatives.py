@@ -1,8 +1,8 @@
-"""First and second derivatives of the whole problem, put together from those of the stages.
+"""First and second derivatives of the whole problem, assembled from those of the stages.
 
 CasADi would differentiate the sum over N compiled calls by its chain rule: 22 directions through every call and six
 thousand nodes, 2.3 ms per iteration. Here every stage function is called once, mapped over the stages, and one gather
-puts the nonzeros where they belong: 0.5 ms. The results are the same; a test compares them.
+moves the nonzeros to their places: 0.5 ms. The results are the same; a test compares them.
 """
 
 from __future__ import annotations
@@ -90,14 +90,14 @@ def split(x: ca.MX, N: int) -> tuple[ca.MX, ca.MX]:
 
 @dataclass(frozen=True)
 class Rows:
-    """Where the constraints are: fatrop wants an interval's dynamics first, then what else constrains its first node.
+    """Row indices of the constraints: fatrop requires an interval's dynamics first, then other constraints of its first node.
 
     Attributes:
         dynamics: first of 18 rows of every interval, shape (N,).
         start: first of 17 rows of the start condition.
         turn: row of the middle of every interval, shape (N,).
         inner: first row of the path constraints of nodes 1..N, shape (N,).
-        end: first row of what vanishes at the last node.
+        end: first row of the values that vanish at the last node.
         count: number of all rows.
     """
 
@@ -157,7 +157,7 @@ def jacobian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, end: str) 
 
 def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.MX, lam_g: ca.MX, perception: bool,
             end: str, gauss_newton: bool = False) -> tuple[ca.MX, ca.MX]:
-    """Gradient and full Hessian of the Lagrangian lam_f f + lam_g . g; with `gauss_newton` the perception costs' never bends down."""
+    """Gradient and full Hessian of the Lagrangian lam_f f + lam_g . g; `gauss_newton`: perception costs without curvature."""
     f, path = stages.functions, path_functions(p)
     X, U = split(x, N)
     at = constraint_rows(N, len(path), end_size(stages, end))

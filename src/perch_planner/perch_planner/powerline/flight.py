@@ -1,4 +1,4 @@
-"""A solved problem flown through the model at 1 ms: what is checked and what is handed on. [P:V-B]"""
+"""Simulation of a solved problem with the model at 1 ms, for its checks and its trajectory. [P:V-B]"""
 
 from __future__ import annotations
 

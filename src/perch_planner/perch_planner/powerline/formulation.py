@@ -1,4 +1,4 @@
-"""How the nonlinear program of [P:eq14] is written down: its costs and discretisation, ours and those of the paper's authors."""
+"""Formulation of the nonlinear program of [P:eq14]: weights and end conditions, ours and those of the paper's authors."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ class Weights:
 
 @dataclass(frozen=True, kw_only=True)
 class Formulation:
-    """The program and what makes its solution a plan.
+    """A variant of the program, and the accuracy that its solution needs.
 
     Attributes:
-        perch, recovery: cost weights; of a recovery, upright and at rest matters, where it ends hardly.
-        hard_end: the end is a constraint of the program, within a fifth of `accuracy`; else it has its costs alone, as in the paper.
-        ramp: input in the impulse of [P:eq15]; 0: as the equation says.
-        accuracy: position [m] at the end of a perch, tilt [deg] and speed [m/s] at every end; a plan that is worse is refused.
+        perch, recovery: cost weights; those of a recovery weight attitude and rest at the end, and hardly the position.
+        hard_end: the end is constrained, within a fifth of `accuracy`; otherwise it only has costs, as in the paper.
+        ramp: factor of the input in the impulse of [P:eq15]; 0: that of the equation.
+        accuracy: position [m] at the end of a perch, tilt [deg] and speed [m/s] at every end; a less accurate plan is refused.
     """
 
     perch: Weights = Weights()
@@ -48,4 +48,4 @@ class Formulation:
 
 OURS = Formulation()
 PUBLISHED = replace(OURS, perch=Weights(rate_between=0.0), hard_end=False, ramp=0.5, accuracy=(0.005, 1.0, 0.2))
-"""The authors' code, to compare with its trajectories."""
+"""Formulation of the authors' code, for comparison with its trajectories."""

@@ -1,7 +1,7 @@
-"""Initial guesses: where the interior-point method starts decides which local minimum it finds.
+"""Initial guesses, which determine the local minimum that the interior-point method finds.
 
-A quintic in position with the tilt turned over the last half converges from every start that was tried. The paper's hover
-guess finds minima on the wrong side of the line, and a flat minimum-snap trajectory flies through it.
+A quintic in position with the tilt in the last half converges from every start that was tried. The paper's hover guess
+leads to minima on the wrong side of the line, and a flat minimum-snap trajectory passes through the line.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ def smooth(s: np.ndarray) -> np.ndarray:
 
 
 def turn_axis(b3_W: np.ndarray, s3_W: np.ndarray, lean_W: np.ndarray) -> tuple[np.ndarray, float]:
-    """Axis and angle that turn b3 into s3: the shortest way, or, where both are nearly opposite, the way by `lean_W`.
+    """Axis and angle that turn b3 into s3: the shortest way, or, where both are nearly opposite, the way through `lean_W`.
 
-    Every axis in the plane of b3 x s3 and b3 + s3 turns b3 into s3. An upside-down perch on a wire that is inclined by one
-    degree has its shortest way sideways, along the wire; the manoeuvre goes another way.
+    Every axis in the plane of b3 x s3 and b3 + s3 turns b3 into s3. For an upside-down perch on a wire that is inclined by
+    one degree, the shortest way leads sideways, along the wire, unlike the way of the manoeuvre.
 
     Args:
         b3_W, s3_W: unit vectors in W, shape (3,).
-        lean_W: where b3 shall pass when the turn is about a half one, shape (3,).
+        lean_W: direction through which b3 turns where the angle is near 180 degrees, shape (3,).
     """
     across, angle = np.cross(b3_W, s3_W), float(so3.angle_between(b3_W, s3_W))
     axis = across
@@ -49,17 +49,17 @@ def turn_axis(b3_W: np.ndarray, s3_W: np.ndarray, lean_W: np.ndarray) -> tuple[n
 
 
 def body_rates(q_WB: np.ndarray, duration: float) -> np.ndarray:
-    """Body rates of attitudes at equal distances in time, as differences [rad/s], shape (N + 1, 3).
+    """Body rates from attitudes at equal time steps, by differences [rad/s], shape (N + 1, 3).
 
-    Attitudes that turn without a rate are a guess that contradicts itself: the solver's first steps then are as short as a
-    tenth, and a recovery at 80 deg took 36 iterations instead of 24.
+    With zero rates, turning attitudes would be an inconsistent guess: the solver's first steps shrink to a tenth, and a
+    recovery at 80 deg takes 36 iterations instead of 24.
     """
     turns = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(q_WB[:-1]), q_WB[1:])) * (len(q_WB) - 1) / duration
     return 0.5 * (np.vstack([turns[:1], turns]) + np.vstack([turns, turns[-1:]]))
 
 
 def perch_duration(start: np.ndarray, p_end: np.ndarray) -> float:
-    """First guess of T [s] for a perch over a distance."""
+    """First guess of T [s] for a perch, from the distance of its end."""
     return max(1.2, 0.9 + 0.3 * float(np.linalg.norm(p_end - start[:3])))
 
 
@@ -73,13 +73,13 @@ def facing_turn(q_WB: np.ndarray, q_BC: np.ndarray, towards_W: np.ndarray) -> fl
 
 
 def side_turn(q_WB: np.ndarray, q_BC: np.ndarray, line_W: np.ndarray, towards_W: np.ndarray) -> float:
-    """Turn about b3 to the side to which the camera already looks off the line's normal [rad].
+    """Turn about b3 towards the side of the line's normal on which the camera axis already lies [rad].
 
     With the line in view a perch ends with the camera turned along the wire, to the left or to the right. A guess between
-    both sits on a ridge, and the solver takes three times the iterations to leave it.
+    both lies on a ridge of the cost, and the solver takes three times the iterations to leave it.
 
     Args:
-        q_WB, q_BC: attitude, and the camera's on the body, xyzw, shape (4,).
+        q_WB, q_BC: attitude of the body in W, and of the camera on the body, xyzw, shape (4,).
         line_W: direction of the line, shape (3,).
         towards_W: from the vehicle to the line, shape (3,).
     """
@@ -91,17 +91,17 @@ def side_turn(q_WB: np.ndarray, q_BC: np.ndarray, line_W: np.ndarray, towards_W:
 def perch_guess(model: RotorModel, start: np.ndarray, p_end: np.ndarray, s3_W: np.ndarray, height_min: float,
                 intervals: int, duration: float | None = None, yaw_turn: float = 0.0, aside: float = 0.0
                 ) -> tuple[np.ndarray, np.ndarray]:
-    """Quintic in position, tilt turned over the last half.
+    """Initial guess of a perch: quintic in position, tilt in the last half.
 
     Args:
         model: constants.
         start: state, shape (17,).
         p_end: wanted end position in W [m], shape (3,).
         s3_W: wanted direction of b3 at the end, shape (3,).
-        height_min: the guess stays above [m].
+        height_min: least height of the guess [m].
         intervals: N.
         duration: T [s]; chosen by distance when None.
-        yaw_turn: turn about the vertical in the first quarter, to look at the line [rad].
+        yaw_turn: turn about the vertical in the first quarter, towards the line [rad].
         aside: turn about b3 until the end [rad].
 
     Returns:
@@ -129,7 +129,7 @@ def perch_guess(model: RotorModel, start: np.ndarray, p_end: np.ndarray, s3_W: n
 
 def recovery_guess(model: RotorModel, start: np.ndarray, p_end: np.ndarray, height_min: float, intervals: int,
                    duration: float = 1.2) -> tuple[np.ndarray, np.ndarray]:
-    """Away from the line along b3, falling while upside down, upright after 60 % of the time.
+    """Initial guess of a recovery: away from the line along b3, with a drop while upside down, upright after 60 % of the time.
 
     Args and returns as `perch_guess`, with b3 = e3 at the end.
     """

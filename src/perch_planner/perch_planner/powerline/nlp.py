@@ -20,13 +20,13 @@ _FREE = np.inf
 
 @dataclass(frozen=True)
 class Structure:
-    """What fixes the sparsity of a problem, and so needs a solver of its own.
+    """Parameters that determine the sparsity of a problem; each structure has its own solver.
 
     Attributes:
         intervals: N.
         lines: number of segments to avoid; the first is the target.
-        perception: whether the costs of [P:eq9, P:eq12, P:eq13] are part of it.
-        end: what vanishes at the last node, "perched" or "hovering" of the stage functions; "": nothing, the end has costs alone.
+        perception: whether the costs of [P:eq9, P:eq12, P:eq13] are part of the problem.
+        end: stage function that vanishes at the last node, "perched" or "hovering"; "": none, the end only has costs.
         solver: "fatrop" or "ipopt".
     """
 
@@ -39,7 +39,7 @@ class Structure:
 
 @dataclass(frozen=True)
 class Numbers:
-    """One problem of a structure: everything that changes from solve to solve.
+    """Data of one problem of a structure: all values that change from solve to solve.
 
     Attributes:
         start: x_init [P:eq14b], shape (17,).
@@ -52,11 +52,11 @@ class Numbers:
         height_min: z_min with its margin [m]. [P:eq14e]
         thrust: bounds of a rotor's thrust [N]. [P:eq14f]
         body_rate: bound of |w_WB_B| [rad/s].
-        end_room: how far from zero what vanishes at the last node may be, one value or as many as there are.
+        end_room: tolerances of the values that vanish at the last node, one each, see `solving.end_room`.
         clearance: least (d^2 - 1) / (d^2 + 1) of the scaled distance d to a line at each node but the first, see
             `stage_functions`, shape (N,). [P:eq14j]
         states, inputs: initial guess, shapes (N + 1, 18) and (N, 4), inputs in [-1, 1].
-        defects: what is added to the integrator's result at the end of every interval, shape (N, 18); see `defects_of`.
+        defects: correction of the integrator's result at the end of every interval, shape (N, 18); see `defects_of`.
     """
 
     start: np.ndarray
@@ -78,16 +78,16 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Solution:
-    """What the solver found.
+    """Result of a solve.
 
     Attributes:
         states, inputs: shapes (N + 1, 18) and (N, 4).
         converged: the solver reports a local optimum.
-        status: the solver's own word.
+        status: status text of the solver.
         cost: value of [P:eq14a].
         iterations: of the interior-point method.
         time: wall-clock time of the solve [s].
-        cpu_time: time of this process' threads in the solve [s].
+        cpu_time: CPU time of this process in the solve [s].
     """
 
     states: np.ndarray
@@ -168,13 +168,13 @@ class Problem:
         self._solver = ca.nlpsol("powerline", name, problem, options)
 
     def _start_options(self, name: str) -> dict[str, float]:
-        """How to begin from a good guess: with a small barrier, and without pushing it far off its active bounds."""
+        """Solver options to start from a good guess: a small barrier, and a small push off its active bounds."""
         if self.barrier is None:
             return {}
         return {f"{name}.mu_init": self.barrier, f"{name}.bound_push": self.push, f"{name}.bound_frac": self.push}
 
     def _bounds(self, numbers: Numbers) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of the variables; T is bounded at the first node only, for it is the same at all."""
+        """Bounds of the variables; T is bounded at the first node only, as it is equal at all nodes."""
         N = self.structure.intervals
         low, high = np.full((N + 1, STRIDE), -_FREE), np.full((N + 1, STRIDE), _FREE)
         low[1:, 2] = numbers.height_min
@@ -187,7 +187,7 @@ class Problem:
         """Error of the problem's integrator along a trajectory: a four times finer step minus its own, shape (N, 18).
 
         Two RK4 steps per interval drift by millimetres until the end. The error hardly changes between neighbouring
-        trajectories: added as a constant in the next solve, it is gone from that solve's result.
+        trajectories: added as a constant in the next solve, it is compensated there.
         """
         step, N = self.stages.functions["step"], self.structure.intervals
         coarse = step(states[:-1].T, inputs.T, 1.0 / N)

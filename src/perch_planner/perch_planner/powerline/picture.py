@@ -22,7 +22,7 @@ SIGHT_LENGTH = 0.5  # of the drawn camera axis [m]
 
 
 class SideView:
-    """Projection on the vertical plane that is square to the target line."""
+    """Projection on the vertical plane perpendicular to the target line."""
 
     def __init__(self, line: Segment, start: np.ndarray) -> None:
         horizontal = np.cross(line.direction, [0.0, 0.0, 1.0])
@@ -31,7 +31,7 @@ class SideView:
         self.origin = start
 
     def __call__(self, points_W: np.ndarray) -> np.ndarray:
-        """Points in W, shape (..., 3), as (distance towards the line, height), shape (..., 2)."""
+        """Project points in W, shape (..., 3), to (distance towards the line, height), shape (..., 2)."""
         points_W = np.asarray(points_W, float)
         seen: np.ndarray = np.stack([(points_W - self.origin) @ self.right_W, points_W[..., 2]], axis=-1)
         return seen
@@ -69,7 +69,7 @@ def _body(axes: Axes, view: SideView, planned: PlannedProblem, state: np.ndarray
 
 
 def draw_manoeuvre(planned: PlannedProblem, path: Path, bodies: int = 12) -> None:
-    """The manoeuvre from the side: bodies with their thrust direction (short) and camera axis (green)."""
+    """Draw the manoeuvre from the side: bodies with their thrust direction (short) and camera axis (green)."""
     figure = Figure(figsize=(9, 6), layout="constrained")
     axes = figure.add_subplot()
     view = _scene(planned, axes)
@@ -85,7 +85,7 @@ def draw_manoeuvre(planned: PlannedProblem, path: Path, bodies: int = 12) -> Non
 
 
 def draw_visibility(planned: PlannedProblem, path: Path, without: Manoeuvre | None = None) -> None:
-    """Reprojection error and segment visibility of the target line over the perch, as the paper's Fig. 7.
+    """Draw reprojection error and segment visibility of the target line over the perch, as the paper's Fig. 7.
 
     Args:
         planned: the plan.
@@ -112,7 +112,7 @@ def draw_visibility(planned: PlannedProblem, path: Path, without: Manoeuvre | No
 
 
 def draw_animation(planned: PlannedProblem, path: Path, rate: float = 20.0) -> None:
-    """The manoeuvre in real time as a GIF, from the side."""
+    """Write an animation of the manoeuvre from the side, in real time, as a GIF."""
     figure = Figure(figsize=(7, 5), layout="constrained")
     axes = figure.add_subplot()
     view = _scene(planned, axes)

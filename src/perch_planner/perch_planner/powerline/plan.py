@@ -1,4 +1,4 @@
-"""A finished powerline plan: states at 1 ms, what was checked, and the trajectory for the controller. [P:V-B]"""
+"""A finished powerline plan: states at 1 ms, certificates, and the trajectory for the controller. [P:V-B]"""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class Manoeuvre:
         times: [s], shape (m,), from 0, about 1 ms apart.
         states: shape (m, 17), see `rotor_model`.
         rates: thrust rates [N/s], shape (m, 4).
-        bounds: what was checked.
+        bounds: certificates of the checked limits.
         intervals: N of the accepted solve.
         solver: fatrop or ipopt.
         iterations: of all solves.
         solve_time: wall-clock time of all solves [s].
-        cpu_time: processor time of all solves [s]; on a quiet machine the same.
+        cpu_time: processor time of all solves [s]; equals `solve_time` on an idle machine.
         cost: value of [P:eq14a].
     """
 
@@ -47,11 +47,11 @@ class Manoeuvre:
 
 @dataclass(frozen=True)
 class PowerlinePlan:
-    """A perch, a recovery, or one after the other.
+    """A perch, a recovery, or a perch followed by a recovery.
 
     Attributes:
-        perch, recovery: None where they were not asked for.
-        without_recovery: why there is no recovery although one was asked for; empty: there is, or none was.
+        perch, recovery: None where not requested; the recovery also where none was found.
+        without_recovery: reason why a requested recovery is missing; empty otherwise.
     """
 
     perch: Manoeuvre | None
@@ -60,7 +60,7 @@ class PowerlinePlan:
 
     @property
     def parts(self) -> tuple[Manoeuvre, ...]:
-        """Perch and recovery, in order, without those that there are not."""
+        """The manoeuvres of the plan in order."""
         return tuple(part for part in (self.perch, self.recovery) if part is not None)
 
     @property
@@ -79,7 +79,7 @@ class PowerlinePlan:
         Args:
             model: constants.
             start_time: stamp of the start [s].
-            step: wanted spacing of the samples [s]; 0: all, about 1 ms. Start, end and the joint are always there.
+            step: wanted spacing of the samples [s]; 0: all, about 1 ms. Start, end and the joint are always included.
         """
         times: list[np.ndarray] = []
         states: list[np.ndarray] = []

@@ -23,7 +23,7 @@ from perch_planner.powerline.validation import check_request
 
 @dataclass
 class PowerlinePlanner:
-    """Plans for one vehicle. Building it loads the compiled functions, and compiles them the first time on a machine."""
+    """Planner for one vehicle. Its construction loads the compiled functions, and compiles them the first time on a machine."""
 
     vehicle: Vehicle
     settings: PowerlineSettings = field(default_factory=PowerlineSettings)
@@ -36,14 +36,14 @@ class PowerlinePlanner:
         self.solver = Solver(self.vehicle, self.gravity, self.settings.camera)
 
     def warm_up(self) -> None:
-        """Build the solvers of the usual structures, with three lines, beforehand, so that the first plan is as fast as the others."""
+        """Build the solvers of the usual structures, with three lines, so that the first plan is as fast as later ones."""
         for perception, end in ((False, "perched"), (True, "perched"), (False, "hovering")):
             for phase in PHASES:
                 if phase != "trial" and (perception or phase != "sight"):  # nobody solves that one without perception costs
                     self.solver.problem(Structure(self.settings.intervals, 3, perception, end), phase)
 
     def plan(self, request: PowerlineRequest) -> PowerlinePlan:
-        """Plan a perch with its recovery, or a recovery alone; a perch after which no recovery is found says so.
+        """Plan a perch with its recovery, or a recovery alone; where no recovery is found, `without_recovery` has the reason.
 
         Raises:
             PlanningRefusal: bad request, or no trajectory within the limits was found.

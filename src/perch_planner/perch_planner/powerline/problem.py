@@ -31,7 +31,7 @@ def _check_direction(key: str, value: tuple[float, ...]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class LineConfig:
-    """A segment; its id is its place in the list."""
+    """A segment; its id is its index in the list."""
 
     centre: Vector3 = quantity(unit="m")
     direction: Vector3 = quantity(doc="need not be normalised")
@@ -44,7 +44,7 @@ class LineConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class StartConfig:
-    """Where the manoeuvre begins, with the rotors carrying the weight."""
+    """Start of the manoeuvre, with the rotor thrusts of a hover."""
 
     position: Vector3 = quantity(unit="m")
     orientation: Quaternion = quantity((0.0, 0.0, 0.0, 1.0), doc="xyzw; normalised")
@@ -93,12 +93,12 @@ class PowerlineProblem:
     settings: PowerlineSettings = part(PowerlineSettings)
 
     def segments(self) -> tuple[Segment, ...]:
-        """The lines, with their places as ids."""
+        """Return the line segments, with their indices as ids."""
         return tuple(Segment(np.array(c.centre), np.array(c.direction), c.half_length, c.radius, i)
                      for i, c in enumerate(self.lines))
 
     def request(self, vehicle: Vehicle) -> PowerlineRequest:
-        """The problem as the planner takes it.
+        """Convert the problem into a request of the planner.
 
         Raises:
             PlanningRefusal: the target is not among the lines, or the perch is not usable.
@@ -120,7 +120,7 @@ class PowerlineProblem:
 
 @dataclass(frozen=True)
 class PlannedProblem:
-    """A problem with its plan and what made it."""
+    """A problem with its plan, and the vehicle, request and planner of the plan."""
 
     problem: PowerlineProblem
     vehicle: Vehicle
@@ -133,7 +133,7 @@ def load(name_or_path: str | Path) -> PowerlineProblem:
     """Read `config/problems/<name>.yaml` or a file.
 
     Raises:
-        ConfigError: no such file, or a value that is refused.
+        ConfigError: no such file, or an invalid value.
     """
     return config.load(PowerlineProblem, config.find("problems", name_or_path))
 

@@ -1,4 +1,4 @@
-"""A perch, and where the solver finds none, the limit without which there is one: what a caller can change first, then the vehicle's."""
+"""Planning of a perch; where the solver finds none, a search for the limit that prevents it, the vehicle's limits last."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Relaxation(NamedTuple):
     """A limit, and a problem without it.
 
     Attributes:
-        words: for messages.
-        constraint: of a refusal because of it.
-        relaxed: request, settings and vehicle to those without the limit.
+        words: its name in messages.
+        constraint: constraint of a refusal where this limit is the cause.
+        relaxed: maps request, settings and vehicle to those without the limit.
     """
 
     words: str
@@ -44,7 +44,7 @@ RELAXATIONS = (
 
 
 def fly_perch(search: Search, request: PowerlineRequest, pose: PerchPose, until: float) -> Manoeuvre:
-    """A perch; where the first guesses lead to none, the limits are tried first, and then IPOPT while there is time.
+    """Plan a perch; where the first guesses fail, remove limits one at a time, then try IPOPT while there is time.
 
     Args:
         search: of the vehicle, within all limits.
@@ -53,7 +53,7 @@ def fly_perch(search: Search, request: PowerlineRequest, pose: PerchPose, until:
         until: that deadline on the clock of `perf_counter` [s].
 
     Raises:
-        PlanningRefusal: there is none; it names the limit without which there is one.
+        PlanningRefusal: no perch was found; names the limit whose removal admits one, where that is known.
     """
     task = search.perch(request, pose)
     try:
@@ -72,7 +72,7 @@ def fly_perch(search: Search, request: PowerlineRequest, pose: PerchPose, until:
 
 
 def _relaxed(search: Search, task: Task, refusal: NotConverged, until: float) -> Manoeuvre | PlanningRefusal:
-    """A refusal that names the first limit without which a perch is soon found; that perch, where it keeps all limits."""
+    """Return a refusal with the first limit whose removal soon yields a perch, or that perch where it keeps all limits."""
     words = f"none of these alone is seen to be the cause: {', '.join(relaxation.words for relaxation in RELAXATIONS)}"
     for relaxation in RELAXATIONS:
         if perf_counter() + refusal.patience > until:

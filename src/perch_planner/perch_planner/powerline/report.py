@@ -1,4 +1,4 @@
-"""What a planned problem leaves on disk: the trajectory as CSV, figures and checks as JSON, pictures."""
+"""Report files of a planned problem: the trajectory as CSV, figures and checks as JSON, pictures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COLUMNS = ("t", "p_x", "p_y", "p_z", "q_x", "q_y", "q_z", "q_w", "v_x", "v_y", "
 
 
 def write_csv(planned: PlannedProblem, path: Path) -> None:
-    """All samples of perch and recovery in SI units; quaternions xyzw."""
+    """Write all samples of perch and recovery in SI units; quaternions xyzw."""
     t = planned.plan.trajectory(planned.planner.solver.model)
     rows = np.column_stack([t.times, t.p, t.q, t.v, t.w, t.a, t.dw, t.rotor_thrust])
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -50,7 +50,7 @@ def summary(planned: PlannedProblem) -> dict[str, Any]:
 
 
 def _without_awareness(planned: PlannedProblem) -> Manoeuvre | None:
-    """The perch of a plan with perception awareness, planned without it; None where there is nothing to compare."""
+    """Plan the perch of a perception-aware plan again without awareness; None where there is nothing to compare."""
     if not planned.request.perception:
         return None
     try:
@@ -60,14 +60,14 @@ def _without_awareness(planned: PlannedProblem) -> Manoeuvre | None:
 
 
 def write_report(planned: PlannedProblem, folder: Path, animation: bool = False) -> dict[str, Any]:
-    """Write `plan.csv`, `plan.json`, `plan.png`, with a perch `visibility.png`, and if wanted `plan.gif`.
+    """Write `plan.csv`, `plan.json`, `plan.png`, for a perch `visibility.png`, and optionally `plan.gif`.
 
-    A plan with perception awareness is pictured beside the same perch without it, where there is one.
+    A plan with perception awareness is drawn beside the same perch without it, where there is one.
 
     Args:
-        planned: what to report.
-        folder: made where it is missing.
-        animation: also write the film.
+        planned: the planned problem.
+        folder: output folder, created where it is missing.
+        animation: also write `plan.gif`.
 
     Returns:
         The content of the JSON file, with the files' names under "files".

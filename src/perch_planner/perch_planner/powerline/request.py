@@ -1,4 +1,4 @@
-"""What a powerline plan is asked for, and the pose at which the vehicle grips. [P:V-A]"""
+"""Request of a powerline plan, and the pose at which the vehicle grips. [P:V-A]"""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ E3 = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class PerchPose:
-    """Where the vehicle shall come to rest; its yaw about b3 is free.
+    """Wanted end of a perch: pose with free yaw about b3, and velocity.
 
     Attributes:
         p_WB: position of the centre of mass [m], shape (3,).
@@ -29,7 +29,7 @@ class PerchPose:
 
     @property
     def q_WB(self) -> np.ndarray:
-        """An attitude with that b3, xyzw, shape (4,): the body's ellipsoid is round about it where its x and y radii are equal."""
+        """An attitude with b3 = s3, xyzw, shape (4,); its yaw does not matter where the body's x and y radii are equal."""
         half = E3 + self.s3_W
         if np.linalg.norm(half) < 1e-6:
             return np.array([1.0, 0.0, 0.0, 0.0])
@@ -38,7 +38,7 @@ class PerchPose:
 
     @classmethod
     def at(cls, p_WB: np.ndarray, q_WB: np.ndarray, v_W: np.ndarray | None = None) -> PerchPose:
-        """From a full pose (quaternion xyzw); of its attitude only b3 counts, as the gripper may turn about it."""
+        """Create a pose from a full one (quaternion xyzw); only b3 of the attitude is used, as the gripper may turn about b3."""
         p_WB, q_WB = np.array(p_WB, float), np.array(q_WB, float)
         norm = float(np.linalg.norm(q_WB))
         if not abs(norm - 1) < 1e-2:
@@ -48,11 +48,11 @@ class PerchPose:
     @classmethod
     def on_line(cls, line: Segment, point: np.ndarray, pitch: float, offset: float, side_W: np.ndarray,
                 v_W: np.ndarray | None = None) -> PerchPose:
-        """From a point of a line and a pitch about it, see `perch_core.lines.perch_normal`.
+        """Create a pose from a point of a line and a pitch about the line, see `perch_core.lines.perch_normal`.
 
         Args:
             line: the line to grip.
-            point: point near it in W [m], shape (3,); its nearest point of the line counts.
+            point: point near the line in W [m], shape (3,); the nearest point of the line is used.
             pitch: tilt about the line, in [0, pi] [rad].
             offset: from the wire's axis to the centre of mass along b3 [m].
             side_W: a point in W on the side that the vehicle comes from [m], shape (3,).
@@ -79,11 +79,11 @@ class PowerlineRequest:
         start: state, shape (17,), see `rotor_model`.
         lines: all segments to avoid, the target among them.
         target_line: id of the segment to perch on.
-        perch: where to come to rest; None only with `recovery_only`.
+        perch: wanted end of the perch; None only with `recovery_only`.
         perception: keep the target line in view. [P:eq8-13]
         with_recovery: append the recovery. [P:V-B]
         recovery_only: plan a recovery from `start` alone.
-        hover: where a recovery shall tend to [m], shape (3,); the start of the perch when None.
+        hover: target position of a recovery [m], shape (3,); None: that of the start.
         solver: first choice, "fatrop" or "ipopt"; where it does not converge, ipopt is tried.
         deadline: wall-clock time after which no further attempt is begun [s]; 0: the settings'.
     """
@@ -103,7 +103,7 @@ class PowerlineRequest:
         """The line to perch on.
 
         Raises:
-            PlanningRefusal: the map is empty or does not know the line.
+            PlanningRefusal: the map is empty or does not contain the line.
         """
         for line in self.lines:
             if line.id == self.target_line:

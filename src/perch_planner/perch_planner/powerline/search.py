@@ -1,4 +1,4 @@
-"""Perch and recovery: solve, fly at 1 ms, check, and solve again where the check fails. [P:V-B, P:Fig.3]"""
+"""Search for a perch or recovery: solve, simulate at 1 ms, check, and solve again where the check fails. [P:V-B, P:Fig.3]"""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ class Task:
 
     Attributes:
         name: for messages.
-        request: its start, every line for the check, whether the first one is kept in view, solver and deadline.
+        request: start, all lines for the check, whether the target is kept in view, solver and deadline.
         wanted: end pose and velocity.
-        lines: in the problem, the target first.
+        lines: lines in the problem, the target first.
         weights: of the costs.
-        end: what vanishes at the end, see `nlp.Structure`.
+        end: name of the end condition, see `nlp.Structure`.
         duration: bounds of T [s].
-        margins: by which the nodes keep away from the limits.
+        margins: distances of the nodes from the limits.
         guess: attempt and N -> states and inputs.
         accuracy: position [m], tilt [deg], speed [m/s] at the end; inf: any.
-        leaving: clearance that the margins grow to within a quarter of the time, if there is a plan; 0: they stay as they are.
-        approaching: clearance that they have until a tenth of the time before the end, if there is a plan; 0: the same.
-        at_end: clearance that the wanted pose leaves, which no margin exceeds there; 1: any.
+        leaving: clearance margin from a quarter of the time on, reduced where no plan is found; 0: that of `margins`.
+        approaching: clearance margin until a tenth of the time before the end, reduced likewise; 0: that of `margins`.
+        at_end: upper bound of the clearance margin at the end, from the wanted pose; 1: none.
         radius_reduction: taken off the wires' radius [m].
     """
 
@@ -68,7 +68,7 @@ class Task:
 
 
 class NotConverged(PlanningRefusal):
-    """No manoeuvre was found, and nothing says which limit is the cause.
+    """Raised when no manoeuvre was found and the limit that prevents it is unknown.
 
     Attributes:
         patience: time of the first attempt [s]; a trial without a limit, with half as many iterations, takes less.
@@ -82,7 +82,7 @@ class NotConverged(PlanningRefusal):
 
 @dataclass(frozen=True)
 class Search:
-    """Looks for manoeuvres within the limits of a vehicle and of settings; a solver serves searches within other limits too."""
+    """Search for manoeuvres within the limits of a vehicle and settings; searches within other limits can share the solver."""
 
     vehicle: Vehicle
     settings: PowerlineSettings
@@ -90,7 +90,7 @@ class Search:
     solver: Solver
 
     def bounds(self, task: Task, times: np.ndarray, states: np.ndarray, rates: np.ndarray) -> tuple[Certificate, ...]:
-        """Certificates of a flight: all limits and its end."""
+        """Certificates of a simulated flight: all limits and the errors at its end."""
         lines = [line.thinner(task.radius_reduction) for line in task.request.lines]
         return (*certify(self.vehicle, times, states, rates, lines, self.settings.height_min, self._thrust_max(task)),
                 *certify_end(times, states, task.wanted, *task.accuracy))
@@ -100,7 +100,7 @@ class Search:
         return max(self.settings.thrust_share * self.vehicle.thrust_max, float(task.request.start[THRUST].max()))
 
     def perch(self, request: PowerlineRequest, pose: PerchPose) -> Task:
-        """From the start of a request, which has its deadline, to a pose."""
+        """Return the task of a perch from the start of a request to a pose."""
         s, formulation, target = self.settings, self.formulation, request.target()
         turn = aside = 0.0
         if request.perception:
@@ -121,7 +121,7 @@ class Search:
             "perched" if formulation.hard_end else "", s.duration, s.margins, first_guess, formulation.accuracy, approaching=approaching, at_end=at_end)
 
     def recovery(self, request: PowerlineRequest, hover: np.ndarray) -> Task:
-        """From the start of a request towards a hover [m], whatever else it asks for."""
+        """Return the task of a recovery from the start of a request towards a hover position [m], without perception."""
         s, formulation, start = self.settings, self.formulation, request.start
         margins, reduction = self._room(start, request.lines)
 
@@ -135,10 +135,10 @@ class Search:
             (np.inf, *formulation.accuracy[1:]), leaving=margins.leaving, radius_reduction=reduction)
 
     def _room(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
-        """Margins that the start of a recovery leaves, and what to take off the wires' radii for it to begin free.
+        """Margins that the start of a recovery permits, and the reduction of the wires' radii [m] that frees it from collision.
 
         Raises:
-            PlanningRefusal: the body cuts a wire by more than that.
+            PlanningRefusal: the body cuts a wire even with the reduced radius.
         """
         margins, clearance = self.settings.margins, np.inf
         height = min(margins.height, max(0.0, 0.5 * (start[2] - self.settings.height_min)))
@@ -151,21 +151,21 @@ class Search:
                               f"no recovery: the body cuts a line, scaled distance {1 + clearance:.2f} < 1")
 
     def _clearance(self, state: np.ndarray, lines: Sequence[Segment]) -> float:
-        """Scaled distance of the nearest line from the body, less 1, at a state (17,); inf without lines."""
+        """Scaled distance of the nearest line from the body, less 1, at a state; inf without lines."""
         return min((float(scaled_clearance(state[None, P], state[None, Q], line, self.vehicle.body_radii)[0]) for line in lines),
                    default=np.inf)
 
     def fly(self, task: Task, cold: str = "sight", first: int = 0, guesses: int = ATTEMPTS) -> Manoeuvre:
-        """Solve, fly and check until the check passes.
+        """Solve, simulate and check until the check passes.
 
         Args:
-            task: what to solve.
-            cold: phase that begins from a guess.
-            first: attempt to begin with.
-            guesses: attempts of which one at least must converge.
+            task: the manoeuvre.
+            cold: phase of the solver that starts from an initial guess.
+            first: index of the first attempt.
+            guesses: number of attempts after which to give up where none has converged.
 
         Raises:
-            PlanningRefusal: it does not.
+            PlanningRefusal: no manoeuvre passed the check.
         """
         s, vehicle, thrust_max = self.settings, self.vehicle, self._thrust_max(task)
         margins, wish, intervals, lines, solver_name = task.margins, EASED**first, s.intervals, task.lines, task.request.solver
@@ -212,25 +212,25 @@ class Search:
 
 
 def _share(clearance: float) -> float:
-    """(d^2 - 1) / (d^2 + 1) of a scaled distance d = 1 + clearance: what margins are counted in."""
+    """(d^2 - 1) / (d^2 + 1) of a scaled distance d = 1 + clearance: the unit of clearance margins."""
     return 1.0 if np.isinf(clearance) else ((1 + clearance) ** 2 - 1) / ((1 + clearance) ** 2 + 1)
 
 
 def _clearances(least: float, leaving: float, approaching: float, at_end: float, intervals: int) -> np.ndarray:
-    """Clearance margins of all nodes but the first, shape (N,): `least` where a wire is left or met, more in the open."""
+    """Clearance margins of all nodes but the first, shape (N,): `least` near a wire at start or end, more in between."""
     past = np.arange(1, intervals + 1) / intervals
     open_air = np.maximum(np.minimum(4.0 * past, 1.0) * (leaving - least), np.minimum(10.0 * (1.0 - past), 1.0) * (approaching - least))
     return np.minimum(least + np.maximum(open_air, 0.0), at_end + 10.0 * (1.0 - past))
 
 
 def _relevant(lines: tuple[Segment, ...], target: Segment | None, start: np.ndarray, end: np.ndarray) -> tuple[Segment, ...]:
-    """The target, one of the lines, first, then the others nearest to the straight way."""
+    """Lines of the problem: the target first, then the others nearest to the straight path, at most `LINES_MAX`."""
     way = np.linspace(start, end, 20)
     return tuple(sorted(lines, key=lambda line: (line is not target, float(line.distance(way).min())))[:LINES_MAX])
 
 
 def _joined(lines: tuple[Segment, ...], known: tuple[Segment, ...], flown: np.ndarray, reach: float) -> tuple[Segment, ...]:
-    """The lines of the problem, the last replaced by one that the flight came too near to without its being there."""
+    """Add a missing line that the flight came too near to; where there are `LINES_MAX` lines, it replaces the last one."""
     present = {line.id for line in lines}
     for line in known:
         if line.id not in present and float(line.distance(flown[:, P]).min()) < 1.2 * reach:
@@ -239,7 +239,7 @@ def _joined(lines: tuple[Segment, ...], known: tuple[Segment, ...], flown: np.nd
 
 
 def _resampled(found: Solution, intervals: int) -> tuple[np.ndarray, np.ndarray]:
-    """A solution as the guess for another N: states interpolated, inputs held."""
+    """Resample a solution as the guess for another N: states interpolated, inputs held."""
     old = len(found.inputs)
     if old == intervals:
         return found.states, found.inputs

@@ -1,4 +1,4 @@
-"""Requests of `plan_powerline` to what the planner takes, and its plans to answers."""
+"""Conversion of requests of `plan_powerline` into requests of the planner, and of its plans into responses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from perch_planner.powerline.request import PerchPose, PowerlineRequest
 SAMPLE_STEP = 0.004   # spacing of the trajectory's points [s]
 CONTACT_TIME = 0.1    # how long the grip is awaited after a perch without recovery, where the mission says nothing [s]
 POINT_REACH = 3.0
-"""A perch point farther from its line, or beyond its ends, means another one [m]."""
+"""Greatest distance of a perch point from its line segment; a point farther away is refused [m]."""
 
 
 class PowerlinePlanError(IntEnum):
@@ -33,10 +33,10 @@ class PowerlinePlanError(IntEnum):
 
 
 def check_request(request: PowerlinePlanRequest) -> None:
-    """Refuse what cannot be a request, before anything is made of it.
+    """Refuse an invalid request before it is converted.
 
     Raises:
-        ConfigError: names the field, its value and the range.
+        ConfigError: a value is out of range; names the field, its value and the range.
     """
     limits.check("request", request)
     if len(request.rotor_thrust) not in (0, 4):
@@ -47,15 +47,15 @@ def check_request(request: PowerlinePlanRequest) -> None:
 
 
 def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offset: float) -> PowerlineRequest:
-    """The planner's request of one that was checked.
+    """Convert a checked request into one of the planner.
 
     Args:
-        request: as asked.
+        request: checked request of the service.
         model: of the vehicle, for the thrusts of a hover.
         wire_offset: from the wire's axis to the centre of mass along b3 [m].
 
     Raises:
-        PerchError: values that cannot be a request.
+        PerchError: the values are not a valid request.
     """
     start = hover_state(model, np.asarray(request.p, float), np.asarray(request.q, float))
     start[V], start[W] = request.v, request.w
@@ -80,10 +80,10 @@ def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offse
 
 
 def answer(found: plan.PowerlinePlan, model: RotorModel, start: int) -> PowerlinePlan:
-    """The answer that carries a plan.
+    """Return the response with a plan.
 
     Args:
-        found: what was planned.
+        found: the plan.
         model: of the vehicle, for the accelerations.
         start: stamp of the trajectory's start [ns].
     """
@@ -104,10 +104,10 @@ def answer(found: plan.PowerlinePlan, model: RotorModel, start: int) -> Powerlin
 
 
 def refused(error: Exception) -> PowerlinePlan:
-    """The answer where there is no plan.
+    """Return the response without a plan.
 
     Args:
-        error: a `PlanningRefusal`, what a job ends with, or what is wrong with the request.
+        error: a `PlanningRefusal`, the exception that ended the job, or the error of an invalid request.
     """
     if isinstance(error, PlanningRefusal):
         code = PowerlinePlanError[error.code.upper()]

@@ -1,4 +1,4 @@
-"""What a user may choose about powerline planning: margins, durations, the weights of perception, a deadline."""
+"""Settings of powerline planning: margins, durations, perception weights, deadline."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from perch_core.errors import ConfigError
 from perch_core.vehicle import Vehicle
 
 DEADLINE_MAX = 10.0
-"""No plan may take longer, whatever a request asks for [s]."""
+"""Greatest deadline of a plan, which also limits the deadlines of requests [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class PerceptionWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class Margins:
-    """By how much the nodes keep away from the limits, so that these hold between the nodes too.
+    """Distances of the nodes from the limits, so that the limits also hold between the nodes.
 
     A plan whose 1 ms trajectory violates a limit is solved again with a larger N. [P:V-B]
     """
@@ -39,7 +39,7 @@ class Margins:
 
 @dataclass(frozen=True, kw_only=True)
 class PowerlineSettings:
-    """Everything about a powerline plan that does not change from request to request."""
+    """Settings of powerline plans that are common to all requests."""
 
     intervals: int = quantity(30, low=10, high=120, doc="N of [P:eq14]")
     height_min: float = quantity(0.8, unit="m", low=-1000.0, high=1000.0, doc="z_min of [P:eq14e]")
@@ -58,10 +58,10 @@ class PowerlineSettings:
                 raise ConfigError("", key, f"[{low:g}, {high:g}] s is not an interval")
 
     def check(self, vehicle: Vehicle) -> None:
-        """Refuse a vehicle for which there are no plans with these settings.
+        """Refuse a vehicle for which these settings cannot be used.
 
         Raises:
-            ConfigError: it lacks the camera or a largest rate of its thrusts.
+            ConfigError: the vehicle lacks the camera or `thrust_rate_max`.
         """
         if self.camera not in vehicle.mounts:
             raise ConfigError("powerline_planner", "camera", f"vehicle {vehicle.name} has no camera {self.camera!r}")

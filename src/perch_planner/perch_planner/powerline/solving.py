@@ -1,10 +1,10 @@
-"""The solve, and with perception costs the approach to it.
+"""Phases of a solve; with perception costs, a Gauss-Newton phase comes first.
 
-Perception costs bend down far from their minimum: with the exact Hessian fatrop then crawls behind its regularisation, 30 to
-80 iterations. Gauss-Newton comes near in a dozen and would never arrive (it goes to and fro over the kinks of the soft
-constraints), so that it is stopped there, and the solve ends what it began.
+Perception costs have negative curvature far from their minimum: with the exact Hessian, regularisation slows fatrop down to 30
+to 80 iterations. Gauss-Newton comes near the minimum in a dozen but does not converge (it oscillates across the kinks of the soft
+constraints). It is therefore stopped there, and the exact solve follows.
 
-The end is a box, not an equality: fatrop 1 loops for ever over eleven equalities at the last node.
+The end is constrained to a box, not by equalities: fatrop 1 does not terminate with eleven equalities at the last node.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ SOFT_UNTIL = 0.667        # share of the horizon
 
 @dataclass
 class Solver:
-    """Solvers of one vehicle, built when first needed and kept.
+    """Solvers of one vehicle, built on first use and cached.
 
     Attributes:
         vehicle: body, limits, cameras.
         gravity: [m/s^2].
-        camera: name of the camera that the perception costs are about.
+        camera: name of the camera of the perception costs.
     """
 
     vehicle: Vehicle
@@ -74,16 +74,16 @@ class Solver:
         return self._problems[key]
 
     def solve(self, structure: Structure, numbers: Numbers, start_phase: str = "sight") -> Solution:
-        """All phases that a guess of this quality needs.
+        """Run all phases that a guess of this quality needs.
 
         Args:
-            structure: which solver.
+            structure: selects the solver.
             numbers: the problem without defects.
-            start_phase: "sight" for a cold guess, "trial" for one that is soon given up, "solve" for the solution of a similar problem, "polish" for one that
-                is right but for the integrator's error.
+            start_phase: "sight" for a cold guess, "trial" for a cold guess with fewer iterations, "solve" for the solution of a
+                similar problem, "polish" for a guess that is right up to the integrator's error.
 
         Returns:
-            The last phase's solution, with iterations and times of all; where the first phase diverges, its own.
+            The solution of the last phase, with iterations and times of all; that of the first phase where it diverges.
         """
         iterations, time, cpu_time = 0, 0.0, 0.0
         cold = start_phase in ("sight", "trial")
@@ -103,7 +103,7 @@ class Solver:
 
 
 def end_room(end: str, position: float, tilt_deg: float, speed: float) -> np.ndarray:
-    """How far from zero the values of `perched`, `hovering` or nothing ("") of the stage functions may be, for an accuracy."""
+    """Tolerances of the values of the stage function `perched`, `hovering` or none ("") that an accuracy permits."""
     turned, moving = [np.radians(tilt_deg)] * 2, [speed] * 3
     shares: list[float] = {"perched": [position] * 3 + turned + moving, "hovering": turned + moving, "": []}[end]
     rest = {"perched": [RATE_ROOM] * 3 + [MOMENT_ROOM] * 3, "hovering": [RATE_ROOM] * 3 + [THRUST_ROOM] * 4, "": []}[end]
@@ -128,7 +128,7 @@ def end_weights(weights: Weights) -> np.ndarray:
 def see_weights(weights: PerceptionWeights, intervals: int) -> np.ndarray:
     """Perception weights of every node with their exponential decay, shape (N, 3). [P:V-A]
 
-    The camera cannot see the line at the end of the perch, so that neither the cost nor the constraints may rule there.
+    The line is out of view at the end of the perch, so neither the cost nor the constraints may dominate there.
     """
     k = np.arange(intervals) * 30.0 / intervals
     soft = np.exp(-SOFT_DECAY * np.maximum(0.0, k - 30 * SOFT_UNTIL))

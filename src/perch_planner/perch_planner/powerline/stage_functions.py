@@ -2,8 +2,8 @@
 
 Each is one small function of one stage. The solver's per-stage structure lets them be compiled once and called N times,
 which makes the compile short (the whole NLP unrolled takes seven times as long) and the solve fast. Their derivatives are
-written out here as well: put together by `derivatives`, they cost a fifth of what CasADi's own chain rule through N
-compiled calls does.
+generated here as well: assembled by `derivatives`, they take a fifth of the time of CasADi's own chain rule through N
+compiled calls.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ RUN_WEIGHTS, SEE_WEIGHTS, END_WEIGHTS, REFERENCE = 4, 3, 6, 12
 
 @dataclass(frozen=True)
 class StageModel:
-    """What the stage functions depend on besides their arguments.
+    """Constants of the stage functions.
 
     Attributes:
         rotor: the 17-state model.
@@ -70,9 +70,9 @@ def _halfway(model: StageModel, x: Vector, u: Vector, unit_step: Scalar) -> Vect
 def _run(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, weights: Vector) -> Scalar:
     """Running cost of thrust and body rate. [P:eq15]
 
-    weights: thrust, body rate, ramp, body rate in the middle of the interval. The paper counts the body rate at the nodes
-    alone; a light body then swings between them, where nothing counts. The impulse is N times the paper's gamma T / N + u T^2 / (2 N^2), that is
-    gamma T + ramp mu T^2 with ramp = thrust_rate_max / (2 N); the authors' code has ramp = 1/2 in its place.
+    weights: thrust, body rate, ramp, body rate in the middle of the interval. The paper weights the body rate at the nodes
+    only; a light body then oscillates between them at no cost. The impulse is N times the paper's gamma T / N + u T^2 / (2 N^2),
+    that is gamma T + ramp mu T^2 with ramp = thrust_rate_max / (2 N); the authors' code has ramp = 1/2 instead.
     """
     T = x[STATES]
     impulse = tuple(gamma * T + weights[2] * mu * T * T for gamma, mu in zip(x[THRUST], u))
@@ -81,16 +81,16 @@ def _run(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, weights: Ve
 
 
 def _violated(h: Scalar) -> Scalar:
-    """By how much a soft constraint h > 0 is violated; squared, exactly what a slack with a quadratic cost gives."""
+    """Violation of a soft constraint h > 0; its square equals the cost of a slack with quadratic cost."""
     return ca.fmax(0, -h)
 
 
 def _sight(model: StageModel, x: Vector, line: Vector) -> Vector:
-    """What the perception cost weighs and squares: reprojection, cheirality, segment visibility. [uses P:eq9, P:eq12, P:eq13]
+    """Residuals of the perception cost: reprojection, cheirality, segment visibility. [uses P:eq9, P:eq12, P:eq13]
 
-    The authors' arctan of [P:eq13] has no slope where the camera looks along the line, so that a solver started so never
-    turns. The angle of (d, s d) of `lines.segment_place` says the same, and falls linearly as the camera turns. As it is
-    soft, it aims at less than s^2 < 1, see SEGMENT_AIM.
+    The authors' arctan of [P:eq13] has zero slope where the camera axis is parallel to the line, so that a solver started
+    there never turns it. The angle of (d, s d) of `lines.segment_place` is equivalent and decreases linearly as the camera
+    turns. As the constraint is soft, it aims well inside s^2 < 1, see SEGMENT_AIM.
     """
     o_C, l_C = lines.line_in_camera(x[P], x[Q], line[0:3], line[3:6], model.p_BC, model.q_BC)
     n_I, l_I = lines.image_line(o_C, l_C)
@@ -128,12 +128,12 @@ def _end(model: StageModel, x: Vector, reference: Vector, weights: Vector) -> Sc
 
 
 def _turned(x: Vector, reference: Vector) -> Vector:
-    """What vanishes where b3 is s3: the first two components of s3 in the body frame. (Where b3 is -s3, too.)"""
+    """First two components of s3 in the body frame, which vanish where b3 is s3 (or -s3)."""
     return rotate_back(x[Q], reference[3:6])[:2]
 
 
 def _perched(model: StageModel, x: Vector, reference: Vector) -> Vector:
-    """What vanishes where a perch ends: the errors of `_ended`, and the moment, so that a gripper has time to close; 14 values."""
+    """Values that vanish at the end of a perch: the errors of `_ended`, and the moment, for a gripper to close; 14 values."""
     return (*_ended(x, reference), *(dot(row, x[THRUST]) for row in model.rotor.torque))
 
 
@@ -144,7 +144,7 @@ def _ended(x: Vector, reference: Vector) -> Vector:
 
 
 def _hovering(model: StageModel, x: Vector, reference: Vector) -> Vector:
-    """What vanishes where a recovery ends, wherever that is: as `_ended`, with the rotor thrusts for the position, 12 values."""
+    """Values that vanish at the end of a recovery, at any position: as `_ended`, rotor thrusts for the position; 12 values."""
     return (*_ended(x, reference)[3:], *(gamma - model.rotor.hover for gamma in x[THRUST]))
 
 
@@ -152,7 +152,7 @@ def _clear(model: StageModel, x: Vector, line: Vector) -> Scalar:
     """[P:eq7] divided by |o x l|^2 + |l|^2 + k: (d^2 - 1) / (d^2 + 1) of the scaled distance d.
 
     The sign is the paper's, but the value is dimensionless, between -1 and 1, and its slope at contact is 1, so that
-    a solver's tolerance and a margin mean the same everywhere.
+    a solver's tolerance and a margin have the same meaning everywhere.
     """
     radii = tuple(r + line[6] for r in model.body_radii)
     h = lines.segment_clearance(x[P], x[Q], line[0:3], line[3:6], line[7], line[6], model.body_radii)
@@ -161,14 +161,14 @@ def _clear(model: StageModel, x: Vector, line: Vector) -> Scalar:
 
 
 def _spin(x: Vector, limit: Scalar) -> Scalar:
-    """1 - |w|^2 / limit^2: positive where the body turns slower than its limit, about whatever axis."""
+    """1 - |w|^2 / limit^2: positive where the body rate is below its limit, about any axis."""
     return 1 - dot(x[W], x[W]) / (limit * limit)
 
 
 def _turn(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, limit: Scalar) -> Scalar:
     """`_spin` in the middle of the interval that starts at a node.
 
-    A light body may reach its greatest rate between two nodes and stop at both: 5000 rad/s^3 are within its torque.
+    A light body may reach its greatest rate between two nodes and be at rest at both: its torque permits 5000 rad/s^3.
     Body rate and thrusts do not depend on the rest of the state, so that this costs little.
     """
     return _spin(_halfway(model, x, u, unit_step), limit)
@@ -176,16 +176,16 @@ def _turn(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, limit: Sca
 
 @dataclass(frozen=True)
 class StageFunctions:
-    """The functions of one stage with their derivatives as flat vectors of nonzeros, and where these belong.
+    """The functions of one stage, their derivatives as flat vectors of nonzeros, and the sparsity of these.
 
     Attributes:
         functions: by name. `step(x, u, 1/N) -> x_next`; `run(x, u, 1/N, weights)`, `see(x, line, weights)`,
             `end(x, reference, weights)` -> cost; `clear(x, line)`, `spin(x, limit)`, `turn(x, u, 1/N, limit)` -> constraint,
-            `perched(x, reference)`, `hovering(x, reference)` -> what vanishes at the end,
+            `perched(x, reference)`, `hovering(x, reference)` -> values that vanish at the end,
             with x of 18 values (17 states, T) and u of 4 in [-1, 1]. `<name>_jac(...)` -> nonzeros of the
             Jacobian; `<name>_hess(..., lam)` -> gradient of lam . f and then the nonzeros
             of the upper triangle of its Hessian. Derivatives are with respect to x, or (x, u).
-            `see_gauss_newton` is `see_hess` without the curvature of what is squared: never negative.
+            `see_gauss_newton` is `see_hess` without the curvature of the residuals: positive semidefinite.
         jacobian, hessian: sparsity of these nonzeros by base name; the Hessian's is an upper triangle.
     """
 
@@ -194,7 +194,7 @@ class StageFunctions:
     hessian: dict[str, ca.Sparsity]
 
     def with_functions(self, functions: dict[str, ca.Function]) -> StageFunctions:
-        """The same with other bodies under the same names (compiled ones)."""
+        """Return a copy with other bodies, such as compiled ones, under the same names."""
         return StageFunctions(functions, self.jacobian, self.hessian)
 
 
@@ -247,5 +247,5 @@ def _nonzeros(matrix: ca.SX) -> ca.SX:
 
 
 def line_parameters(segment: lines.Segment) -> np.ndarray:
-    """A segment as the stage functions take it, shape (8,)."""
+    """Parameters of a segment for the stage functions, shape (8,)."""
     return np.array([*segment.centre, *segment.direction, segment.radius, segment.half_length])

@@ -1,4 +1,4 @@
-"""Requests that cannot be planned, refused before any solver runs, with the cause and what to change."""
+"""Validation of requests: refusals before any solver runs, with the cause and what to change."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SPEED_MAX = 10.0  # no start of a perch is faster [m/s]
 
 
 def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> PerchPose | None:
-    """Refuse a request that no plan can answer; return where to perch, None for a recovery alone.
+    """Refuse a request that cannot be planned; return the perch pose, None for a recovery alone.
 
     Raises:
         PlanningRefusal: code bad_input, empty_map, start_invalid or perch_in_collision; the message names the value.

@@ -1,4 +1,4 @@
-"""How well a manoeuvre keeps its line in view: the measures of the paper's Fig. 7. [P:eq9, P:eq12, P:eq13]"""
+"""Visibility of the target line along a manoeuvre: the measures of the paper's Fig. 7. [P:eq9, P:eq12, P:eq13]"""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Visibility:
         reprojection: distance of the line from the image centre [px], shape (m,). [P:eq9]
         cheirality: h_lc > 0: the line is in front, shape (m,). [P:eq12]
         segment: the segment is at the centre, shape (m,). [P:eq13]
-        in_image: share of the segment's sample points that the camera really sees, shape (m,).
+        in_image: share of the segment's sample points inside the image, shape (m,).
     """
 
     reprojection: np.ndarray

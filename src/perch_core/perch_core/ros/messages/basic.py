@@ -1,4 +1,4 @@
-"""Parts that messages share: stamps, vectors, poses."""
+"""Conversions of common parts of messages: stamps, vectors, poses."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def header(stamp: int, frame: str) -> Header:
 
 
 def require_measured(gyro: float, accelerometer: float) -> None:
-    """Check the first entries of the covariances of an `Imu`: -1 says that there is no such measurement.
+    """Check the first entries of the covariances of an `Imu`: -1 means that there is no such measurement.
 
     Raises:
-        PerchError: one is missing.
+        PerchError: a measurement is missing.
     """
     if gyro < 0.0 or accelerometer < 0.0:
         missing = "angular velocity" if gyro < 0.0 else "acceleration"
@@ -39,10 +39,10 @@ def require_measured(gyro: float, accelerometer: float) -> None:
 
 
 def require_body(child_frame: str) -> None:
-    """Check the frame whose pose and twist an `Odometry` has.
+    """Check the child frame of an `Odometry`, to which pose and twist refer.
 
     Raises:
-        PerchError: it is not the body.
+        PerchError: it is not the body frame.
     """
     if child_frame not in ("base_link", ""):
         raise PerchError(f"odometry: child_frame_id is {child_frame!r}: pose and twist must be those of base_link")
@@ -79,10 +79,10 @@ def to_pose(p: Numbers, q: Numbers) -> Pose:
 
 
 def flat(matrix: np.ndarray) -> np.ndarray:
-    """A matrix row by row, float64, as messages carry it."""
+    """Return a matrix row by row, float64, as in messages."""
     return np.ascontiguousarray(matrix, dtype=float).ravel()
 
 
 def square(values: Numbers, n: int) -> np.ndarray:
-    """`n` * `n` numbers, row by row, as a matrix."""
+    """Return `n` * `n` numbers, row by row, as a matrix."""
     return np.array(values, dtype=float).reshape(n, n)

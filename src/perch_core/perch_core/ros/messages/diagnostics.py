@@ -1,4 +1,4 @@
-"""Diagnostics of a component as `diagnostic_msgs/DiagnosticArray`."""
+"""Conversions of a component's diagnostics to and from `diagnostic_msgs/DiagnosticArray`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from perch_core.ros.messages.basic import stamp_value, to_stamp
 
 
 def diagnostics_message(diagnostics: Diagnostics, name: str = "") -> DiagnosticArray:
-    """One status; numbers are written with six digits. `name`: fully qualified name of the node."""
+    """Convert diagnostics to an array of one status; floats have six digits. `name`: fully qualified name of the node."""
     status = DiagnosticStatus(level=bytes([diagnostics.level]), name=name, message=diagnostics.message, hardware_id="perch")
     status.values = [KeyValue(key=key, value=f"{v:.6g}" if isinstance(v, float) else str(v)) for key, v in diagnostics.values.items()]
     array = DiagnosticArray(status=[status])
@@ -19,7 +19,7 @@ def diagnostics_message(diagnostics: Diagnostics, name: str = "") -> DiagnosticA
 
 
 def diagnostics_value(msg: DiagnosticArray) -> Diagnostics:
-    """The first status of an array; `values` also has its `node`."""
+    """Convert the first status of an array; `values` also has the node's name as `node`."""
     status = msg.status[0] if msg.status else DiagnosticStatus()
     values: dict[str, Any] = {"node": status.name} | {pair.key: pair.value for pair in status.values}
     level = status.level[0] if isinstance(status.level, bytes) else int(status.level)

@@ -1,4 +1,4 @@
-"""The messages of the 500 Hz topics, on the wire: what `sensing`, `states` and `flight` do with rclpy's objects, in a tenth of the time."""
+"""Serialisation of the 500 Hz topics: as in `sensing`, `states` and `flight`, without rclpy's objects, in a tenth of the time."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ _1, _3, _4, _6, _7, _8 = (Struct(f"<{n}d") for n in (1, 3, 4, 6, 7, 8))
 
 
 def pack_imu(sample: ImuSample) -> bytes:
-    """`sensor_msgs/Imu` of a sample."""
+    """Return the serialised `sensor_msgs/Imu` of a sample."""
     floats = b"".join((_NO_ORIENTATION, _3.pack(*sample.w_B), _NO_COVARIANCE, _3.pack(*sample.f_B), _NO_COVARIANCE))
     return _IMU.pack(*divmod(sample.stamp, NANOSECONDS), sample.frame, floats)
 
 
 def unpack_imu(data: bytes) -> ImuSample:
-    """The sample of a `sensor_msgs/Imu`; a PerchError where it does not measure both."""
+    """Return the sample of a `sensor_msgs/Imu`; PerchError if a measurement is missing."""
     sec, nanosec, frame, x = _IMU.unpack(data)
     require_measured(*_1.unpack_from(x, 16 * 8), *_1.unpack_from(x, 28 * 8))
     return ImuSample(sec * NANOSECONDS + nanosec, _3.unpack_from(x, 13 * 8), _3.unpack_from(x, 25 * 8), frame)
 
 
 def pack_odometry(s: OdometryState) -> bytes:
-    """`nav_msgs/Odometry` of a state."""
+    """Return the serialised `nav_msgs/Odometry` of a state."""
     floats = b"".join((_7.pack(*s.p_WB, *s.q_WB), np.asarray(s.pose_covariance, "<f8").tobytes(),
                        _6.pack(*s.v_B, *s.w_B), np.asarray(s.twist_covariance, "<f8").tobytes()))
     return _ODOMETRY.pack(*divmod(s.stamp, NANOSECONDS), s.frame, "base_link", floats)
 
 
 def unpack_odometry(data: bytes) -> OdometryState:
-    """The state of a `nav_msgs/Odometry`; a PerchError where it is not the body's."""
+    """Return the state of a `nav_msgs/Odometry`; PerchError if it is not that of the body."""
     sec, nanosec, frame, child, x = _ODOMETRY.unpack(data)
     require_body(child)
     pose, twist, covariances = _7.unpack_from(x), _6.unpack_from(x, 43 * 8), np.frombuffer(x, "<f8")
@@ -50,35 +50,35 @@ def unpack_odometry(data: bytes) -> OdometryState:
 
 
 def pack_motor(command: MotorCommand) -> bytes:
-    """`perch_msgs/MotorCommand` of a command."""
+    """Return the serialised `perch_msgs/MotorCommand` of a command."""
     return _MOTOR.pack(*divmod(command.stamp, NANOSECONDS), "base_link", command.armed, _4.pack(*command.rotor_speed))
 
 
 def unpack_motor(data: bytes) -> MotorCommand:
-    """The command of a `perch_msgs/MotorCommand`."""
+    """Return the command of a `perch_msgs/MotorCommand`."""
     sec, nanosec, _, armed, speeds = _MOTOR.unpack(data)
     return MotorCommand(sec * NANOSECONDS + nanosec, armed, _4.unpack(speeds))
 
 
 def pack_rates(command: RatesThrust) -> bytes:
-    """`perch_msgs/RatesThrust` of a command."""
+    """Return the serialised `perch_msgs/RatesThrust` of a command."""
     return _RATES.pack(*divmod(command.stamp, NANOSECONDS), "base_link", command.armed, _4.pack(*command.w_B, command.thrust))
 
 
 def unpack_rates(data: bytes) -> RatesThrust:
-    """The command of a `perch_msgs/RatesThrust`."""
+    """Return the command of a `perch_msgs/RatesThrust`."""
     sec, nanosec, _, armed, x = _RATES.unpack(data)
     *w_B, thrust = _4.unpack(x)
     return RatesThrust(sec * NANOSECONDS + nanosec, armed, tuple(w_B), thrust)
 
 
 def pack_attitude(command: AttitudeThrust) -> bytes:
-    """`perch_msgs/AttitudeThrust` of a command."""
+    """Return the serialised `perch_msgs/AttitudeThrust` of a command."""
     return _ATTITUDE.pack(*divmod(command.stamp, NANOSECONDS), "map", command.armed, _8.pack(*command.q_WB, *command.w_B, command.thrust))
 
 
 def unpack_attitude(data: bytes) -> AttitudeThrust:
-    """The command of a `perch_msgs/AttitudeThrust`."""
+    """Return the command of a `perch_msgs/AttitudeThrust`."""
     sec, nanosec, _, armed, x = _ATTITUDE.unpack(data)
     *attitude, wx, wy, wz, thrust = _8.unpack(x)
     return AttitudeThrust(sec * NANOSECONDS + nanosec, armed, tuple(attitude), (wx, wy, wz), thrust)

@@ -1,4 +1,4 @@
-"""Trajectories, commands, the controller's answers."""
+"""Conversions of trajectories, commands and the controller's answers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FRAME = "map"
 
 
 def trajectory_message(trajectory: FlatTrajectory | SampledTrajectory) -> Trajectory:
-    """A trajectory to `perch_msgs/Trajectory`, to be held at its end."""
+    """Convert a trajectory to `perch_msgs/Trajectory`, with `at_end` HOLD."""
     msg = Trajectory(header=header(nanoseconds(trajectory.start_time), FRAME), recovery_start=-1.0)
     if isinstance(trajectory, FlatTrajectory):
         for duration, (x, y, z, yaw) in zip(trajectory.durations, trajectory.coefficients):
@@ -43,7 +43,7 @@ def trajectory_message(trajectory: FlatTrajectory | SampledTrajectory) -> Trajec
 
 
 def trajectory_value(msg: Trajectory) -> FlatTrajectory | SampledTrajectory:
-    """The trajectory that a message carries: the samples where there are any, the polynomials otherwise.
+    """Return the trajectory of a message: the samples if it has any, otherwise the polynomials.
 
     Raises:
         PerchError: empty, of unequal lengths, not finite, or in another frame than `map`.
@@ -71,7 +71,7 @@ def trajectory_value(msg: Trajectory) -> FlatTrajectory | SampledTrajectory:
 
 
 def order_message(order: TrajectoryOrder) -> Trajectory:
-    """An order to `perch_msgs/Trajectory`."""
+    """Convert an order to `perch_msgs/Trajectory`."""
     msg = trajectory_message(order.trajectory)
     msg.id, msg.at_end = int(order.id), int(order.at_end)
     msg.contact_time, msg.recovery_start = float(order.contact_time), float(order.recovery_start)
@@ -79,10 +79,10 @@ def order_message(order: TrajectoryOrder) -> Trajectory:
 
 
 def order_value(msg: Trajectory) -> TrajectoryOrder:
-    """`perch_msgs/Trajectory` to an order.
+    """Convert `perch_msgs/Trajectory` to an order.
 
     Raises:
-        PerchError: no trajectory (see `trajectory_value`), or an unknown `at_end`.
+        PerchError: invalid trajectory (see `trajectory_value`), or an unknown `at_end`.
     """
     try:
         at_end = AtEnd(msg.at_end)
@@ -98,51 +98,51 @@ def order_value(msg: Trajectory) -> TrajectoryOrder:
 
 
 def command_message(command: ControllerCommand) -> CommandMessage:
-    """To `perch_msgs/ControllerCommand`."""
+    """Convert to `perch_msgs/ControllerCommand`."""
     return CommandMessage(header=header(command.stamp, FRAME), command=int(command.command), reason=command.reason)
 
 
 def command_value(msg: CommandMessage) -> ControllerCommand:
-    """`perch_msgs/ControllerCommand`."""
+    """Convert from `perch_msgs/ControllerCommand`."""
     return ControllerCommand(stamp_value(msg.header.stamp), msg.command, msg.reason)
 
 
 def motor_message(command: MotorCommand) -> MotorMessage:
-    """To `perch_msgs/MotorCommand`."""
+    """Convert to `perch_msgs/MotorCommand`."""
     msg = MotorMessage(header=header(command.stamp, "base_link"), armed=bool(command.armed))
     msg.rotor_speed = np.array(command.rotor_speed, float)
     return msg
 
 
 def motor_value(msg: MotorMessage) -> MotorCommand:
-    """`perch_msgs/MotorCommand`."""
+    """Convert from `perch_msgs/MotorCommand`."""
     return MotorCommand(stamp_value(msg.header.stamp), msg.armed, tuple(msg.rotor_speed.tolist()))
 
 
 def rates_message(command: RatesThrust) -> RatesMessage:
-    """To `perch_msgs/RatesThrust`."""
+    """Convert to `perch_msgs/RatesThrust`."""
     return RatesMessage(header=header(command.stamp, "base_link"), armed=bool(command.armed), body_rates=to_vector(command.w_B),
                         thrust=float(command.thrust))
 
 
 def rates_value(msg: RatesMessage) -> RatesThrust:
-    """`perch_msgs/RatesThrust`."""
+    """Convert from `perch_msgs/RatesThrust`."""
     return RatesThrust(stamp_value(msg.header.stamp), msg.armed, floats(msg.body_rates), msg.thrust)
 
 
 def attitude_message(command: AttitudeThrust) -> AttitudeMessage:
-    """To `perch_msgs/AttitudeThrust`."""
+    """Convert to `perch_msgs/AttitudeThrust`."""
     return AttitudeMessage(header=header(command.stamp, FRAME), armed=bool(command.armed), attitude=to_quaternion(command.q_WB),
                            body_rates=to_vector(command.w_B), thrust=float(command.thrust))
 
 
 def attitude_value(msg: AttitudeMessage) -> AttitudeThrust:
-    """`perch_msgs/AttitudeThrust`."""
+    """Convert from `perch_msgs/AttitudeThrust`."""
     return AttitudeThrust(stamp_value(msg.header.stamp), msg.armed, quaternion_floats(msg.attitude), floats(msg.body_rates), msg.thrust)
 
 
 def status_message(status: ControllerStatus) -> StatusMessage:
-    """To `perch_msgs/ControllerStatus`."""
+    """Convert to `perch_msgs/ControllerStatus`."""
     return StatusMessage(
         header=header(status.stamp, FRAME), state=int(status.state), controller=status.controller, trajectory_id=int(status.trajectory_id),
         trajectory_time=float(status.trajectory_time), trajectory_duration=float(status.trajectory_duration),
@@ -151,14 +151,14 @@ def status_message(status: ControllerStatus) -> StatusMessage:
 
 
 def status_value(msg: StatusMessage) -> ControllerStatus:
-    """`perch_msgs/ControllerStatus`."""
+    """Convert from `perch_msgs/ControllerStatus`."""
     return ControllerStatus(
         stamp_value(msg.header.stamp), msg.state, msg.controller, msg.trajectory_id, msg.trajectory_time, msg.trajectory_duration,
         msg.position_error, msg.odometry_age, msg.thrust_margin, msg.thrust_ratio, msg.message)
 
 
 def reference_message(x: ControlReference) -> ReferenceMessage:
-    """To `perch_msgs/ControlReference`."""
+    """Convert to `perch_msgs/ControlReference`."""
     return ReferenceMessage(
         header=header(x.stamp, FRAME), trajectory_id=int(x.trajectory_id), pose=to_pose(x.p, x.q), linear_velocity=to_vector(x.v),
         linear_acceleration=to_vector(x.a), angular_velocity=to_vector(x.w), angular_acceleration=to_vector(x.dw), thrust=float(x.thrust),
@@ -166,7 +166,7 @@ def reference_message(x: ControlReference) -> ReferenceMessage:
 
 
 def reference_value(msg: ReferenceMessage) -> ControlReference:
-    """`perch_msgs/ControlReference`."""
+    """Convert from `perch_msgs/ControlReference`."""
     return ControlReference(
         stamp_value(msg.header.stamp), msg.trajectory_id, floats(msg.pose.position), quaternion_floats(msg.pose.orientation),
         floats(msg.linear_velocity), floats(msg.linear_acceleration), floats(msg.angular_velocity), floats(msg.angular_acceleration),
@@ -177,20 +177,20 @@ def reference_value(msg: ReferenceMessage) -> ControlReference:
 
 
 def choose_law_value(msg: SetController.Request) -> ChooseLaw:
-    """Request of `set_controller`."""
+    """Convert a request of `set_controller`."""
     return ChooseLaw(msg.type, msg.adaptive)
 
 
 def law_chosen_message(answer: LawChosen) -> SetController.Response:
-    """Answer of `set_controller`."""
+    """Convert an answer of `set_controller` to its message."""
     return SetController.Response(success=bool(answer.success), error_code=int(answer.error_code), message=answer.message)
 
 
 def ask_value(_: Trigger.Request) -> Ask:
-    """Request of a std_srvs/Trigger."""
+    """Convert a request of a std_srvs/Trigger."""
     return Ask()
 
 
 def done_message(answer: Done) -> Trigger.Response:
-    """Answer of a std_srvs/Trigger."""
+    """Convert an answer of a std_srvs/Trigger to its message."""
     return Trigger.Response(success=bool(answer.success), message=answer.message)

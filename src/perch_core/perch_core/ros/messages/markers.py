@@ -1,4 +1,4 @@
-"""Markers as `visualization_msgs/MarkerArray`."""
+"""Conversions of markers to and from `visualization_msgs/MarkerArray`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from visualization_msgs.msg import MarkerArray
 
 
 def markers_message(value: Markers) -> MarkerArray:
-    """The message of several markers, in `map`."""
+    """Convert markers, in `map`, to `visualization_msgs/MarkerArray`."""
     return MarkerArray(markers=[_message(item, value.stamp) for item in value.markers])
 
 
 def markers_value(msg: MarkerArray) -> Markers:
-    """`visualization_msgs/MarkerArray`, of the shapes that there are values of."""
+    """Convert `visualization_msgs/MarkerArray`; markers whose type is not in `Shape` are left out."""
     stamp = stamp_value(msg.markers[0].header.stamp) if msg.markers else 0
     return Markers(stamp, tuple(_value(item) for item in msg.markers if item.type in Shape.__members__.values()))
 

@@ -1,4 +1,4 @@
-"""The Perch action."""
+"""Conversions of goal, feedback and result of the Perch action."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from perch_msgs.action import Perch
 
 
 def goal_value(msg: Perch.Goal) -> PerchGoal:
-    """The goal."""
+    """Convert a goal message to the goal."""
     pose = msg.search_pose.pose
     return PerchGoal(
         mode=msg.mode, takeoff_height=msg.takeoff_height, search_frame=msg.search_pose.header.frame_id, search_position=floats(pose.position),
@@ -18,7 +18,7 @@ def goal_value(msg: Perch.Goal) -> PerchGoal:
 
 
 def goal_message(goal: PerchGoal) -> Perch.Goal:
-    """The goal, for clients."""
+    """Convert a goal to its message, for clients."""
     msg = Perch.Goal(
         mode=int(goal.mode), takeoff_height=float(goal.takeoff_height), search_timeout=float(goal.search_timeout),
         inclination_hint=float(goal.inclination_hint), perch_point=to_point(goal.perch_point), perch_pitch=float(goal.perch_pitch),
@@ -28,18 +28,18 @@ def goal_message(goal: PerchGoal) -> Perch.Goal:
 
 
 def feedback_message(feedback: PerchFeedback) -> Perch.Feedback:
-    """How it goes."""
+    """Convert feedback to its message."""
     return Perch.Feedback(phase=feedback.phase, progress=float(feedback.progress), time_to_contact=float(feedback.time_to_contact),
                           message=feedback.message)
 
 
 def rejected(why: str) -> PerchResult:
-    """Of a goal that is not taken."""
+    """Return the result of a rejected goal, with the reason as its message."""
     return PerchResult(False, Perch.Result.BAD_GOAL, why)
 
 
 def result_message(result: PerchResult) -> Perch.Result:
-    """How it ended."""
+    """Convert a result to its message."""
     return Perch.Result(
         success=bool(result.success), error_code=int(result.error_code), message=result.message, contact_time=float(result.contact_time),
         end_time=float(result.end_time), final_pose=to_pose(result.final_position, result.final_attitude))

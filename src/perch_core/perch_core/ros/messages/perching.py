@@ -1,4 +1,4 @@
-"""Target poses and the map of powerlines."""
+"""Conversions of target poses and the map of powerlines."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _check_frame(msg: PoseWithCovarianceStamped | PowerlineArray) -> None:
 
 
 def target_value(msg: PoseWithCovarianceStamped) -> TargetPose:
-    """`geometry_msgs/PoseWithCovarianceStamped` to the target's pose.
+    """Convert `geometry_msgs/PoseWithCovarianceStamped` to the target's pose.
 
     Raises:
         PerchError: in another frame than `map`.
@@ -37,12 +37,12 @@ def target_value(msg: PoseWithCovarianceStamped) -> TargetPose:
 
 
 def target_message(pose: TargetPose) -> PoseWithCovarianceStamped:
-    """The target's pose to `geometry_msgs/PoseWithCovarianceStamped` in `map`."""
+    """Convert the target's pose to `geometry_msgs/PoseWithCovarianceStamped` in `map`."""
     return PoseWithCovarianceStamped(header=header(pose.stamp, FRAME), pose=_pose_message(pose))
 
 
 def sighting_value(msg: TargetDetection) -> TargetSighting:
-    """`perch_msgs/TargetDetection` to a sighting."""
+    """Convert `perch_msgs/TargetDetection` to a sighting."""
     stamp = stamp_value(msg.header.stamp)
     return TargetSighting(
         stamp, msg.found, _pose(stamp, msg.pose) if msg.found else None, _pose(stamp, msg.pose_camera) if len(msg.ids) else None,
@@ -50,7 +50,7 @@ def sighting_value(msg: TargetDetection) -> TargetSighting:
 
 
 def sighting_message(sighting: TargetSighting) -> TargetDetection:
-    """A sighting to `perch_msgs/TargetDetection`."""
+    """Convert a sighting to `perch_msgs/TargetDetection`."""
     msg = TargetDetection(
         header=header(sighting.stamp, FRAME), found=bool(sighting.found), ids=[int(i) for i in sighting.ids],
         reprojection_rms=float(sighting.reprojection_rms), frames_fused=int(sighting.frames_fused), method=sighting.method,
@@ -63,19 +63,19 @@ def sighting_message(sighting: TargetSighting) -> TargetDetection:
 
 
 def powerline_value(msg: Powerline) -> MappedPowerline:
-    """`perch_msgs/Powerline`."""
+    """Convert from `perch_msgs/Powerline`."""
     return MappedPowerline(msg.id, floats(msg.start), floats(msg.end), msg.radius, square(msg.covariance, 3), msg.direction_sigma, msg.observations)
 
 
 def powerline_message(line: MappedPowerline) -> Powerline:
-    """To `perch_msgs/Powerline`."""
+    """Convert to `perch_msgs/Powerline`."""
     return Powerline(
         id=int(line.id), start=to_point(line.start), end=to_point(line.end), radius=float(line.radius), covariance=flat(line.covariance),
         direction_sigma=float(line.direction_sigma), observations=int(line.observations))
 
 
 def map_value(msg: PowerlineArray) -> PowerlineMap:
-    """`perch_msgs/PowerlineArray` to the map.
+    """Convert `perch_msgs/PowerlineArray` to the map.
 
     Raises:
         PerchError: in another frame than `map`.
@@ -85,6 +85,6 @@ def map_value(msg: PowerlineArray) -> PowerlineMap:
 
 
 def map_message(lines: PowerlineMap) -> PowerlineArray:
-    """The map to `perch_msgs/PowerlineArray`."""
+    """Convert the map to `perch_msgs/PowerlineArray`."""
     return PowerlineArray(header=header(lines.stamp, FRAME), lines=[powerline_message(line) for line in lines.lines],
                           degenerate=bool(lines.degenerate), message=lines.message)

@@ -1,4 +1,4 @@
-"""Requests to the planners and their answers."""
+"""Conversions of requests to the planners and their answers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _pose(pose: Pose) -> tuple[np.ndarray, np.ndarray]:
 
 
 def certificate_message(c: Certificate) -> CertificateMessage:
-    """To `perch_msgs/Certificate`."""
+    """Convert to `perch_msgs/Certificate`."""
     return CertificateMessage(
         quantity=c.quantity, unit=c.unit, lower_limit=float(c.lower_limit), upper_limit=float(c.upper_limit), minimum=float(c.minimum),
         maximum=float(c.maximum), time_of_minimum=float(c.time_of_minimum), time_of_maximum=float(c.time_of_maximum), method=c.method,
@@ -32,7 +32,7 @@ def certificate_message(c: Certificate) -> CertificateMessage:
 
 
 def certificate_value(c: CertificateMessage) -> Certificate:
-    """`perch_msgs/Certificate`."""
+    """Convert from `perch_msgs/Certificate`."""
     return Certificate(
         quantity=c.quantity, unit=c.unit, lower_limit=c.lower_limit, upper_limit=c.upper_limit, minimum=c.minimum, maximum=c.maximum,
         time_of_minimum=c.time_of_minimum, time_of_maximum=c.time_of_maximum, method=c.method, holds=c.holds)
@@ -42,7 +42,7 @@ def certificate_value(c: CertificateMessage) -> Certificate:
 
 
 def perch_request_message(r: PerchPlanRequest) -> PlanPerch.Request:
-    """Request of `plan_perch`."""
+    """Convert a request of `plan_perch` to its message."""
     msg = PlanPerch.Request(
         start_time=to_stamp(r.start), start_position=to_point(r.p), start_velocity=to_vector(r.v), start_acceleration=to_vector(r.a),
         start_jerk=to_vector(r.j), start_yaw=float(r.yaw), start_yaw_rate=float(r.yaw_rate), target=to_pose(r.p_WS, r.q_WS),
@@ -58,10 +58,10 @@ def perch_request_message(r: PerchPlanRequest) -> PlanPerch.Request:
 
 
 def perch_request_value(msg: PlanPerch.Request) -> PerchPlanRequest:
-    """Request of `plan_perch`; options that are NaN are left to the planner.
+    """Convert a request message of `plan_perch`; options that are NaN become None.
 
     Raises:
-        PerchError: `current` is no trajectory.
+        PerchError: `current` is not a valid trajectory.
     """
     p_WS, q_WS = _pose(msg.target)
     options = {name: None if math.isnan(value := getattr(msg, name)) else value for name in OPTIONS}
@@ -75,7 +75,7 @@ def perch_request_value(msg: PlanPerch.Request) -> PerchPlanRequest:
 
 
 def perch_plan_message(plan: PerchPlan) -> PlanPerch.Response:
-    """Answer of `plan_perch`."""
+    """Convert an answer of `plan_perch` to its message."""
     msg = PlanPerch.Response(
         success=bool(plan.success), error_code=int(plan.error_code), message=plan.message,
         certificates=[certificate_message(c) for c in plan.certificates], iterations=int(plan.iterations), solve_time=float(plan.solve_time))
@@ -87,7 +87,7 @@ def perch_plan_message(plan: PerchPlan) -> PlanPerch.Response:
 
 
 def perch_plan_value(msg: PlanPerch.Response) -> PerchPlan:
-    """Answer of `plan_perch`."""
+    """Convert an answer message of `plan_perch`."""
     return PerchPlan(
         success=msg.success, error_code=msg.error_code, message=msg.message, trajectory=trajectory_value(msg.trajectory) if msg.success else None,
         contact_time=msg.trajectory.contact_time, certificates=tuple(certificate_value(c) for c in msg.certificates), iterations=msg.iterations,
@@ -98,7 +98,7 @@ def perch_plan_value(msg: PlanPerch.Response) -> PerchPlan:
 
 
 def powerline_request_message(r: PowerlinePlanRequest) -> PlanPowerline.Request:
-    """Request of `plan_powerline`."""
+    """Convert a request of `plan_powerline` to its message."""
     msg = PlanPowerline.Request(
         start_time=to_stamp(r.start), start_pose=to_pose(r.p, r.q), start_velocity=to_vector(r.v), start_angular_velocity=to_vector(r.w),
         start_rotor_thrust=[float(f) for f in r.rotor_thrust], lines=[powerline_message(line) for line in r.lines],
@@ -111,7 +111,7 @@ def powerline_request_message(r: PowerlinePlanRequest) -> PlanPowerline.Request:
 
 
 def powerline_request_value(msg: PlanPowerline.Request) -> PowerlinePlanRequest:
-    """Request of `plan_powerline`."""
+    """Convert a request message of `plan_powerline`."""
     p, q = _pose(msg.start_pose)
     return PowerlinePlanRequest(
         start=stamp_value(msg.start_time), p=p, q=q, v=_array(msg.start_velocity), w=_array(msg.start_angular_velocity),
@@ -122,7 +122,7 @@ def powerline_request_value(msg: PlanPowerline.Request) -> PowerlinePlanRequest:
 
 
 def powerline_plan_message(plan: PowerlinePlan) -> PlanPowerline.Response:
-    """Answer of `plan_powerline`."""
+    """Convert an answer of `plan_powerline` to its message."""
     msg = PlanPowerline.Response(
         success=bool(plan.success), error_code=int(plan.error_code), message=plan.message,
         certificates=[certificate_message(c) for c in plan.certificates], perch_time=float(plan.perch_time),
@@ -136,7 +136,7 @@ def powerline_plan_message(plan: PowerlinePlan) -> PlanPowerline.Response:
 
 
 def powerline_plan_value(msg: PlanPowerline.Response) -> PowerlinePlan:
-    """Answer of `plan_powerline`."""
+    """Convert an answer message of `plan_powerline`."""
     t = msg.trajectory
     return PowerlinePlan(
         success=msg.success, error_code=msg.error_code, message=msg.message, trajectory=trajectory_value(t) if msg.success else None,

@@ -1,4 +1,4 @@
-"""IMU samples, images, camera models, transforms."""
+"""Conversions of IMU samples, images, camera models and transforms."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _ENCODINGS = {"8UC1": "mono8", "8UC3": "bgr8"}  # what the bytes mean in ROS' ge
 
 
 def imu_value(msg: Imu) -> ImuSample:
-    """`sensor_msgs/Imu` to its sample; a PerchError where it does not measure both."""
+    """Convert `sensor_msgs/Imu` to a sample; PerchError if a measurement is missing."""
     require_measured(msg.angular_velocity_covariance[0], msg.linear_acceleration_covariance[0])
     return ImuSample(stamp_value(msg.header.stamp), floats(msg.angular_velocity), floats(msg.linear_acceleration), msg.header.frame_id)
 
 
 def imu_message(sample: ImuSample) -> Imu:
-    """A sample to `sensor_msgs/Imu`, without orientation."""
+    """Convert a sample to `sensor_msgs/Imu`, without orientation."""
     msg = Imu(header=header(sample.stamp, sample.frame), angular_velocity=to_vector(sample.w_B), linear_acceleration=to_vector(sample.f_B))
     msg.orientation_covariance[0] = -1.0  # sensor_msgs: no orientation
     return msg
 
 
 def image_value(msg: Image) -> CameraImage:
-    """`sensor_msgs/Image` to an image; the pixels are a view of the message's data.
+    """Convert `sensor_msgs/Image` to an image; the pixels are a view of the message's data.
 
     Raises:
-        PerchError: an encoding other than mono8, 8UC1, rgb8, bgr8, 8UC3, or data cut short.
+        PerchError: an encoding other than mono8, 8UC1, rgb8, bgr8, 8UC3, or truncated data.
     """
     if msg.encoding not in CHANNELS:
         raise PerchError(f"image: encoding {msg.encoding!r} is not one of {', '.join(CHANNELS)}")
@@ -48,7 +48,7 @@ def image_value(msg: Image) -> CameraImage:
 
 
 def compressed_value(msg: CompressedImage) -> CameraImage:
-    """`sensor_msgs/CompressedImage` (JPEG, PNG) to an image.
+    """Convert `sensor_msgs/CompressedImage` (JPEG, PNG) to an image.
 
     Raises:
         PerchError: it cannot be decoded.
@@ -64,14 +64,14 @@ def compressed_value(msg: CompressedImage) -> CameraImage:
 
 
 def compressed_message(image: CompressedPixels) -> CompressedImage:
-    """A compressed image to `sensor_msgs/CompressedImage`."""
+    """Convert a compressed image to `sensor_msgs/CompressedImage`."""
     msg = CompressedImage(header=header(image.stamp, image.frame), format=image.format)
     msg.data = array.array("B", image.data)
     return msg
 
 
 def image_message(image: CameraImage) -> Image:
-    """An image to `sensor_msgs/Image`."""
+    """Convert an image to `sensor_msgs/Image`."""
     channels = CHANNELS[image.encoding]
     msg = Image(header=header(image.stamp, image.frame), height=image.height, width=image.width, encoding=image.encoding,
                 step=image.width * channels)
@@ -80,17 +80,17 @@ def image_message(image: CameraImage) -> Image:
 
 
 def camera_info_value(msg: CameraInfo) -> CameraModel:
-    """`sensor_msgs/CameraInfo` (plumb_bob, rational_polynomial, equidistant) to the camera's model.
+    """Convert `sensor_msgs/CameraInfo` (plumb_bob, rational_polynomial, equidistant) to the camera's model.
 
     Raises:
-        PerchError: another distortion model, or a matrix that is none.
+        PerchError: another distortion model, or invalid intrinsics.
     """
     camera = camera_of(msg.distortion_model, msg.width, msg.height, np.reshape(msg.k, (3, 3)), np.array(msg.d, dtype=float))
     return CameraModel(stamp_value(msg.header.stamp), msg.header.frame_id, camera)
 
 
 def camera_info_message(model: CameraModel) -> CameraInfo:
-    """A camera's model to `sensor_msgs/CameraInfo`."""
+    """Convert a camera's model to `sensor_msgs/CameraInfo`."""
     camera = model.camera
     name, d = camera_parameters(camera)
     msg = CameraInfo(header=header(model.stamp, model.frame), height=camera.height, width=camera.width, distortion_model=name)
@@ -101,22 +101,22 @@ def camera_info_message(model: CameraModel) -> CameraInfo:
 
 
 def transform_value(msg: TransformStamped) -> Transform:
-    """One `geometry_msgs/TransformStamped`."""
+    """Convert one `geometry_msgs/TransformStamped`."""
     return Transform(msg.header.frame_id, msg.child_frame_id, floats(msg.transform.translation), quaternion_floats(msg.transform.rotation))
 
 
 def transform_message(value: Transform, stamp: int = 0) -> TransformStamped:
-    """A transform at a stamp [ns] as `geometry_msgs/TransformStamped`."""
+    """Convert a transform at a stamp [ns] to `geometry_msgs/TransformStamped`."""
     msg = TransformStamped(header=header(stamp, value.parent), child_frame_id=value.child)
     msg.transform.translation, msg.transform.rotation = to_vector(value.p), to_quaternion(value.q)
     return msg
 
 
 def stamped_transform_value(msg: TransformStamped) -> StampedTransform:
-    """One `geometry_msgs/TransformStamped` with its stamp."""
+    """Convert one `geometry_msgs/TransformStamped` with its stamp."""
     return StampedTransform(stamp_value(msg.header.stamp), *transform_value(msg))
 
 
 def stamped_transform_message(value: StampedTransform) -> TransformStamped:
-    """A stamped transform as `geometry_msgs/TransformStamped`."""
+    """Convert a stamped transform to `geometry_msgs/TransformStamped`."""
     return transform_message(Transform(*value[1:]), value.stamp)

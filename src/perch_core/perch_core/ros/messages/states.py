@@ -1,4 +1,4 @@
-"""Odometry, VIO's state, the estimator's health, truth."""
+"""Conversions of odometry, VIO's state, the estimator's health, and ground truth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from perch_msgs.msg import RotorState as RotorStateMessage
 
 
 def odometry_value(msg: Odometry) -> OdometryState:
-    """`nav_msgs/Odometry` to a state; a PerchError where it is not the body's."""
+    """Convert `nav_msgs/Odometry` to a state; PerchError if it is not that of the body."""
     require_body(msg.child_frame_id)
     pose, twist = msg.pose.pose, msg.twist.twist
     return OdometryState(
@@ -23,7 +23,7 @@ def odometry_value(msg: Odometry) -> OdometryState:
 
 
 def odometry_message(state: OdometryState) -> Odometry:
-    """A state to `nav_msgs/Odometry`."""
+    """Convert a state to `nav_msgs/Odometry`."""
     msg = Odometry(header=header(state.stamp, state.frame), child_frame_id="base_link")
     msg.pose.pose = to_pose(state.p_WB, state.q_WB)
     msg.twist.twist.linear, msg.twist.twist.angular = to_vector(state.v_B), to_vector(state.w_B)
@@ -32,7 +32,7 @@ def odometry_message(state: OdometryState) -> Odometry:
 
 
 def inertial_value(msg: VioState) -> InertialState:
-    """`perch_msgs/VioState` to the whole inertial state."""
+    """Convert `perch_msgs/VioState` to the full inertial state."""
     return InertialState(
         stamp_value(msg.header.stamp), np.array(floats(msg.position)), np.array(quaternion_floats(msg.orientation)),
         np.array(floats(msg.velocity)), np.array(floats(msg.gyro_bias)), np.array(floats(msg.accel_bias)), square(msg.covariance, 15),
@@ -40,7 +40,7 @@ def inertial_value(msg: VioState) -> InertialState:
 
 
 def inertial_message(state: InertialState) -> VioState:
-    """The whole inertial state to `perch_msgs/VioState`."""
+    """Convert the full inertial state to `perch_msgs/VioState`."""
     return VioState(
         header=header(state.stamp, state.frame), position=to_point(state.p_WB), orientation=to_quaternion(state.q_WB),
         velocity=to_vector(state.v_WB), gyro_bias=to_vector(state.gyro_bias), accel_bias=to_vector(state.accel_bias),
@@ -48,14 +48,14 @@ def inertial_message(state: InertialState) -> VioState:
 
 
 def health_value(msg: EstimatorStatus) -> EstimatorHealth:
-    """`perch_msgs/EstimatorStatus` to the estimator's health."""
+    """Convert `perch_msgs/EstimatorStatus` to the estimator's health."""
     return EstimatorHealth(
         stamp_value(msg.header.stamp), msg.state, msg.vio_age, msg.updates_accepted, msg.updates_rejected, msg.nis, floats(msg.gyro_bias),
         floats(msg.accel_bias), msg.position_sigma, msg.attitude_sigma, msg.message)
 
 
 def health_message(health: EstimatorHealth) -> EstimatorStatus:
-    """The estimator's health to `perch_msgs/EstimatorStatus`."""
+    """Convert the estimator's health to `perch_msgs/EstimatorStatus`."""
     return EstimatorStatus(
         header=header(health.stamp, "map"), state=int(health.state), vio_age=float(health.vio_age), updates_accepted=int(health.accepted),
         updates_rejected=int(health.rejected), nis=float(health.nis), gyro_bias=to_vector(health.gyro_bias),
@@ -64,32 +64,32 @@ def health_message(health: EstimatorHealth) -> EstimatorStatus:
 
 
 def rotors_value(msg: RotorStateMessage) -> RotorState:
-    """`perch_msgs/RotorState`."""
+    """Convert from `perch_msgs/RotorState`."""
     return RotorState(stamp_value(msg.header.stamp), tuple(msg.rotor_speed.tolist()), tuple(msg.thrust.tolist()))
 
 
 def rotors_message(state: RotorState) -> RotorStateMessage:
-    """To `perch_msgs/RotorState`."""
+    """Convert to `perch_msgs/RotorState`."""
     return RotorStateMessage(header=header(state.stamp, "base_link"), rotor_speed=np.array(state.speed, float), thrust=np.array(state.thrust, float))
 
 
 def contact_value(msg: ContactMessage) -> Contact:
-    """`perch_msgs/Contact`."""
+    """Convert from `perch_msgs/Contact`."""
     return Contact(stamp_value(msg.header.stamp), msg.state, msg.body, msg.normal_speed, msg.tangential_speed, msg.tilt_error, msg.offset, msg.reason)
 
 
 def contact_message(contact: Contact) -> ContactMessage:
-    """To `perch_msgs/Contact`."""
+    """Convert to `perch_msgs/Contact`."""
     return ContactMessage(
         header=header(contact.stamp, "map"), state=int(contact.state), body=contact.body, normal_speed=float(contact.normal_speed),
         tangential_speed=float(contact.tangential_speed), tilt_error=float(contact.tilt_error), offset=float(contact.offset), reason=contact.reason)
 
 
 def pose_value(msg: PoseStampedMessage) -> PoseStamped:
-    """`geometry_msgs/PoseStamped`."""
+    """Convert from `geometry_msgs/PoseStamped`."""
     return PoseStamped(stamp_value(msg.header.stamp), floats(msg.pose.position), quaternion_floats(msg.pose.orientation))
 
 
 def pose_message(pose: PoseStamped) -> PoseStampedMessage:
-    """To `geometry_msgs/PoseStamped` in `map`."""
+    """Convert to `geometry_msgs/PoseStamped` in `map`."""
     return PoseStampedMessage(header=header(pose.stamp, "map"), pose=to_pose(pose.p, pose.q))

@@ -1,4 +1,4 @@
-"""TF, where `tf2_msgs` is there: with ROS, or built in this workspace."""
+"""Topics of TF, for systems with `tf2_msgs`: part of ROS, or built in this workspace."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def topics() -> tuple[Topic, ...]:
-    """The rows of `/tf` and `/tf_static`: one transform per value."""
+    """Return the rows of `/tf` and `/tf_static`: one transform per value."""
     from perch_core.ros.topics import Topic
 
     return (
