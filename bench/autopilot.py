@@ -33,7 +33,7 @@ TILTED = ((30.0, 2.0), (60.0, 4.0), (90.0, 0.0), (85.0, 6.5))
 """Tilt [deg] and rate [rad/s] of a body in free air at the last commands, which demand that rate."""
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.8, 0.0))
 """Axes of its rotation: roll, pitch, and between them."""
-WATCHED = 6.0                             # after they have stopped [s]
+OBSERVATION_TIME = 6.0                    # after they have stopped [s]
 
 
 @dataclass(frozen=True)
@@ -42,35 +42,35 @@ class Stop:
 
     Attributes:
         tilt: of the body at the last command [deg].
-        most: largest tilt after it [deg].
-        told: time until the autopilot is commanded to level, or off.
+        max_tilt: largest tilt after it [deg].
+        commanded: time until the autopilot is commanded to level, or off.
         levelled: time until the body is level, and stays level.
         down: time until a descent is commanded, or motors are off.
         held: time for which the last command was still sent.
     """
 
     tilt: float
-    most: float
-    told: float
+    max_tilt: float
+    commanded: float
     levelled: float
     down: float
     held: float
 
 
-def begun() -> tuple[Loop, SupervisedLoop, list[float]]:
+def start_flight() -> tuple[Loop, SupervisedLoop, list[float]]:
     """Return a flight before its first step, with its goal sent, its autopilot, and the growing list of times of touches [s]."""
     loop, touched = arrange(SCENARIO, 1), []
     simulation = loop.vehicle.simulation
     simulation.loop.close()
-    simulation.loop = kept = SupervisedLoop(load_vehicle(SCENARIO.vehicle))
+    simulation.loop = supervised = SupervisedLoop(load_vehicle(SCENARIO.vehicle))
     loop.vehicle.contact.receivers.append(lambda event: touched.append(loop.time))
     loop.send("mission", goal_of(SCENARIO))
-    return loop, kept, touched
+    return loop, supervised, touched
 
 
-def moments() -> dict[str, float]:
+def phase_times() -> dict[str, float]:
     """Return the times of `PHASES` in the undisturbed flight [s]."""
-    loop, _, touched = begun()
+    loop, _, touched = start_flight()
     with closing(loop):
         while not any(phase == "perched" for _, phase, _ in loop.trace.phases):
             loop.step()
@@ -87,16 +87,16 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
         gap: its duration [s]; None: for good.
         kill: the node is killed; otherwise it sends nothing.
     """
-    loop, kept, touched = begun()
+    loop, supervised, touched = start_flight()
     with closing(loop):
         while loop.time < at:
             loop.step()
-        kept.kill() if kill else setattr(kept, "cut", True)
-        last, touched[:] = kept.heard, []
+        supervised.kill() if kill else setattr(supervised, "cut", True)
+        last, touched[:] = supervised.last_command, []
         flying = loop.vehicle.simulation.plant.rotor_speed.min() > 0.0
-        until, rows = last + min(gap or WATCHED, WATCHED), []
+        until, rows = last + min(gap or OBSERVATION_TIME, OBSERVATION_TIME), []
         while loop.time < until and not touched:
-            rows.append((loop.time - last, float(tilt_degrees(loop.vehicle.simulation.state.q_WB)), kept.watchdog.mode))
+            rows.append((loop.time - last, float(tilt_degrees(loop.vehicle.simulation.state.q_WB)), supervised.watchdog.mode))
             loop.step()
     t, tilt = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     modes = [row[2] for row in rows]
@@ -118,7 +118,7 @@ def levelled(vehicle: str, axis: tuple[float, float, float], tilt: float, rate: 
     with closing(body.loop):
         body.hover()
         body.found(np.array(axis), tilt, rate)
-        last, body.loop.cut, above = body.loop.heard, True, 0.0
+        last, body.loop.cut, above = body.loop.last_command, True, 0.0
         while body.time < last + 1.5:
             body.step(True)
             above = body.time - last if body.tilt > LEVEL else above
@@ -139,12 +139,12 @@ def held_without_link() -> float:
 
 def taken_over(at: float) -> float:
     """Return the time from the pilot's takeover, with the arming switch off, to the first cycle with motors stopped [s]."""
-    loop, kept, _ = begun()
+    loop, supervised, _ = start_flight()
     with closing(loop):
         while loop.time < at:
             loop.step()
-        kept.radio[4], kept.radio[6], begin = OFF, OFF, loop.time
-        while np.any(kept.aimed):
+        supervised.radio[4], supervised.radio[6], begin = OFF, OFF, loop.time
+        while np.any(supervised.aimed):
             loop.step()
             if loop.time > begin + 1.0:
                 return float("inf")
@@ -154,13 +154,13 @@ def taken_over(at: float) -> float:
 def figures(quick: bool) -> list[Figure]:
     """Measure every phase with every gap; `quick`: only with the node killed."""
     found, out = {}, []
-    print(f"{'phase':16s} {'stop':>8s} {'tilt':>5s} {'most':>5s} {'told':>6s} {'level':>6s} {'down':>6s} {'held':>6s}   [deg], [s]")
-    for name, at in (when := moments()).items():
+    print(f"{'phase':16s} {'stop':>8s} {'tilt':>5s} {'max':>5s} {'sent':>6s} {'level':>6s} {'down':>6s} {'held':>6s}   [deg], [s]")
+    for name, at in (when := phase_times()).items():
         for gap, kill in ((None, True), *(() if quick else ((None, False), *((gap, False) for gap in GAPS)))):
             one = found[name, gap, kill] = stopped(at, gap, kill)
-            word = "killed" if kill else "hung" if gap is None else f"{gap:g} s"
-            times = " ".join(f"{value:6.3f}" for value in (one.told, one.levelled, one.down, one.held))
-            print(f"{name:16s} {word:>8s} {one.tilt:5.0f} {one.most:5.0f} {times}", flush=True)
+            stop = "killed" if kill else "hung" if gap is None else f"{gap:g} s"
+            times = " ".join(f"{value:6.3f}" for value in (one.commanded, one.levelled, one.down, one.held))
+            print(f"{name:16s} {stop:>8s} {one.tilt:5.0f} {one.max_tilt:5.0f} {times}", flush=True)
     flying = {key: one for key, one in found.items() if key[0] != "perched"}
     out.append(figure("last command held", "s", [one.held for one in flying.values()], 0.05, "max <="))
     long = [one for (_, gap, _), one in flying.items() if gap is None or gap > 0.3]

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from perch_core.processes import without_collector
-from perch_eval.revision import made_of
+from perch_eval.revision import code_version
 
 _STATISTICS = {"median": lambda x: float(np.median(x)), "p99": lambda x: float(np.percentile(x, 99)),
                "max": lambda x: float(np.max(x)), "min": lambda x: float(np.min(x))}
@@ -102,7 +102,7 @@ def machine() -> dict[str, object]:
 
 def as_json(group_figures: dict[str, list[Figure]]) -> dict[str, object]:
     """Return the figures in their common JSON form."""
-    return {**made_of(), "machine": machine(),
+    return {**code_version(), "machine": machine(),
             "figures": [{"group": group, **asdict(item)} for group, items in group_figures.items() for item in items]}
 
 

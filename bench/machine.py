@@ -14,13 +14,13 @@ from pathlib import Path
 from perch_core.ros.priority import PRIORITY
 from perch_sim.timing import CONTROL_PERIOD_NS
 
-AWAKE, REST = 0.004, 0.001  # s; a core that spins, and then sleeps for as long as a host does not mind
+SPIN_TIME, SLEEP_TIME = 0.004, 0.001  # of a core, in turn; the sleep is so short that the host does not withdraw the core [s]
 
 _spawn = multiprocessing.get_context("spawn")
 
 
 @contextmanager
-def awake() -> Iterator[None]:
+def cores_awake() -> Iterator[None]:
     """Keep the cores from sleeping, by work that yields to everything else.
 
     A sleeping core of a virtual machine is given away by its host and returns only after milliseconds; on physical real-time
@@ -67,7 +67,7 @@ def late_with_load(load: float, seconds: float) -> float:
     return late
 
 
-class Stolen:
+class StolenTime:
     """Stolen time: processor time since the start that the host of a virtual machine gave to others while a program here was
     runnable; in ticks of 10 ms, as far as the host reports it. Linux."""
 
@@ -104,10 +104,10 @@ def _sleep_until(due: int) -> None:
 def _spin(parent: int) -> None:
     _schedule("SCHED_IDLE", 0)
     while os.getppid() == parent:  # one that was killed cannot end this process
-        rest = time.monotonic() + AWAKE
+        rest = time.monotonic() + SPIN_TIME
         while time.monotonic() < rest:
             pass
-        time.sleep(REST)
+        time.sleep(SLEEP_TIME)
 
 
 def _compute(pipe: Connection, load: float, seconds: float) -> None:

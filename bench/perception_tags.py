@@ -44,10 +44,10 @@ def figures(quick: bool) -> list[Figure]:
                   figure("tags: frame, searching (10 Hz at most)", "ms", first),
                   figure("tags: all four within 1 s", "share", [float(np.mean(acquired))], 0.99, "min >="),
                   figure("tags: flips", "frames", [float(flips)], 0.0, "max ==")]
-    return everything + out + (_beside_pupil(hovers, search) if (search := pupil()) else [])
+    return everything + out + (_compare_with_pupil(hovers, search) if (search := pupil()) else [])
 
 
-def _beside_pupil(hovers: int, search: Callable[[np.ndarray], list]) -> list[Figure]:
+def _compare_with_pupil(hovers: int, search: Callable[[np.ndarray], list]) -> list[Figure]:
     """Compare our corners with those of pupil-apriltags (`pip install pupil-apriltags`, no lens model) in the same images."""
     out = []
     for scenario_name, name, _, _ in PLACES:
@@ -65,9 +65,9 @@ def _beside_pupil(hovers: int, search: Callable[[np.ndarray], list]) -> list[Fig
                                for number, corners in zip(found.ids, mount.camera.project(refined.rays_C)[0])]
             errors["pupil-apriltags"] += [np.linalg.norm(ours_of(tag.corners) - truth[board.ids.index(tag.tag_id)], axis=1)
                                           for tag in search(image) if tag.tag_id in board.ids]
-        for who, each in errors.items():
-            out += [figure(f"tags: found by {who}, one search, {name}", "share", [len(each) / (hovers * len(board.ids))])]
-            out += [figure(f"tags: corners by {who}, {name}", "px", np.concatenate(each))] if each else []
+        for detector, each in errors.items():
+            out += [figure(f"tags: found by {detector}, one search, {name}", "share", [len(each) / (hovers * len(board.ids))])]
+            out += [figure(f"tags: corners by {detector}, {name}", "px", np.concatenate(each))] if each else []
     return out
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from harness import Figure, figure, measure
 from perch_eval import estimation_flight
-from perch_eval.campaign.progress import counted
+from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_core.vehicle import load_vehicle
@@ -27,8 +27,8 @@ def figures(quick: bool) -> list[Figure]:
     """Measure times of VIO frames, UKF steps and updates, and the RMSE through the perch with and without latency."""
     ukf = _ukf(quick)  # by the wall clock: before the flights, which use every core
     tasks = [(scenario, seed) for scenario in (*dict(SCENARIOS), IDEAL) for seed in range(1 if quick else 20)]
-    flown: dict[str, list[_Flown]] = {scenario: [] for scenario, _ in tasks}
-    for (scenario, _), one in counted(in_processes(_fly, tasks), len(tasks), what="perches"):
+    flown: dict[str, list[_FlightErrors]] = {scenario: [] for scenario, _ in tasks}
+    for (scenario, _), one in with_progress(in_processes(_fly, tasks), len(tasks), unit="perches"):
         flown[scenario].append(one)
     costs = [cost for one in sum(flown.values(), []) for cost in one.costs]
     out = [figure("vio: frame (CPU time)", "ms", costs, 10.0), figure("vio: frame p99 (CPU time)", "ms", costs, 20.0, "p99 <="), *ukf]
@@ -44,14 +44,14 @@ def figures(quick: bool) -> list[Figure]:
 
 
 @dataclass(frozen=True)
-class _Flown:
+class _FlightErrors:
     costs: list[float]   # of each frame [ms]
     rmse: np.ndarray     # of each axis through the perch [cm]
     attitude: float      # error at contact [deg]
     delay_costs: float   # RMSE with LATENCY over that without
 
 
-def _fly(task: tuple[str, int]) -> _Flown:
+def _fly(task: tuple[str, int]) -> _FlightErrors:
     """Run VIO and UKF on one rendered perch."""
     cv2.setNumThreads(1)
     scenario = load_scenario(task[0])
@@ -59,7 +59,7 @@ def _fly(task: tuple[str, int]) -> _Flown:
     steps = estimation_flight.run_vio(flight)
     late = estimation_flight.run_estimator(flight, steps, latency=LATENCY)
     prompt = estimation_flight.run_estimator(flight, steps, latency=0.0)
-    return _Flown([1e3 * s.cost for s in steps], 100 * _rmse(late, begin), float(np.degrees(np.linalg.norm(late.errors[-1, 6:9]))),
+    return _FlightErrors([1e3 * s.cost for s in steps], 100 * _rmse(late, begin), float(np.degrees(np.linalg.norm(late.errors[-1, 6:9]))),
                   float(_rmse(late, begin).mean() / _rmse(prompt, begin).mean()))
 
 
@@ -81,14 +81,14 @@ def _ukf(quick: bool) -> list[Figure]:
     def pose(k: int) -> VioPose:
         return VioPose(k * 2_000_000, truth.p_WB[k], q[k], np.eye(6) * 1e-5)
 
-    for took, seen in zip(updates.values(), (state, pose)):
+    for took, measurement in zip(updates.values(), (state, pose)):
         estimator = Estimator()
         for k in range(len(truth.times)):
             begin = time.perf_counter()
             estimator.add_imu(ImuSample(k * 2_000_000, tuple(readings.gyro[k].tolist()), tuple(readings.accel[k].tolist())))
             steps.append(1e6 * (time.perf_counter() - begin))
             if k > 150 and k % 17 == 0:
-                vio = seen(k - 20)
+                vio = measurement(k - 20)
                 begin = time.perf_counter()
                 estimator.add_vio(vio)
                 took.append(1e3 * (time.perf_counter() - begin))

@@ -20,7 +20,7 @@ from random_perches import paper_like_problem, shipped_settings
 
 from perch_core import bernstein
 from perch_core.vehicle import load_vehicle
-from perch_eval.campaign.progress import counted
+from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.workers import in_processes
 from perch_planner import bounds
 from perch_planner.planner import plan
@@ -94,10 +94,10 @@ def _wrong_verdicts(count: int) -> float:
     """Count verdicts on `count` polynomials, a multiple of 100, that the exact chain contradicts; on all processors but one."""
     starts = range(0, count, _CHUNK)
     found = in_processes(_wrong, starts, max(1, (os.cpu_count() or 1) - 1))
-    return float(sum(wrong for _, wrong in counted(found, len(starts), lambda one: not one[1], what=f"times {_CHUNK} verdicts")))
+    return float(sum(wrong for _, wrong in with_progress(found, len(starts), lambda one: not one[1], unit=f"times {_CHUNK} verdicts")))
 
 
-def _say(what: str) -> None:
+def _print_step(what: str) -> None:
     """Print what is measured next."""
     print(f"  {what} ...", file=sys.stderr, flush=True)
 
@@ -106,22 +106,22 @@ def figures(quick: bool) -> list[Figure]:
     """Measure the group; wall-clock times come first, without work in parallel."""
     count = 60 if quick else 400
     out, shipped = [], shipped_settings()
-    _say(f"plans of {count} problems")
+    _print_step(f"plans of {count} problems")
     for waypoints, median, p99 in ((0, 0.25, 1.0), (3, 0.5, 1.5), (10, 0.8, 2.5)):
         times, cpu, refused = _plan_times(waypoints, shipped, count)
         name = f"plan as shipped, {waypoints} waypoints"
         out += [figure(name, "ms", times, median), figure(f"{name}, p99", "ms", times, p99, "p99 <="),
                 figure(f"{name}, CPU time", "ms", cpu), figure(f"{name}: refused of {count}", "problems", [refused])]
-    _say("plans with OSQP")
+    _print_step("plans with OSQP")
     for waypoints in (0, 3):
         times, _, _ = _plan_times(waypoints, replace(shipped, solver="osqp"), count // 10)
         out.append(figure(f"plan with OSQP, {waypoints} waypoints", "ms", times))
     out.append(figure("ten million additions in plain Python, CPU time: the machine's speed", "s", [_additions()]))
-    _say("first plans of a process")
+    _print_step("first plans of a process")
     imported, first = _first_plan(fresh=False)
     out += [figure("import", "s", [imported]), figure("first plan of a process, kernels cached", "s", [first])]
     verdicts = 300 if quick else 10_000
-    _say(f"{verdicts} verdicts" + ("" if quick else ", and the first plan of a checkout beside them"))
+    _print_step(f"{verdicts} verdicts" + ("" if quick else ", and the first plan of a checkout beside them"))
     with ThreadPoolExecutor(1) as beside:
         compiled = None if quick else beside.submit(_first_plan, fresh=True)
         wrong = _wrong_verdicts(verdicts)

@@ -24,7 +24,7 @@ from random_perches import random_problem, shipped_settings
 from perch_core import config
 from perch_core.json_values import to_text, write_json
 from perch_core.vehicle import load_vehicle
-from perch_eval.revision import made_of
+from perch_eval.revision import code_version
 from perch_planner.planner import plan
 from perch_planner.problem import PerchSettings
 from perch_planner.refusals import PerchRefusal
@@ -81,7 +81,7 @@ def main() -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
     ms = 1e3 * np.array(times or [np.nan])
-    result = {**made_of(), "problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
+    result = {**code_version(), "problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
               "findings_of_the_verifier": broken, "unconfirmed_refusals": unconfirmed, "exceptions": exceptions,
               "plan_ms": {"median": float(np.median(ms)), "p90": float(np.percentile(ms, 90)), "max": float(ms.max())},
               "duration_s_median": float(np.median(durations or [np.nan])), "wall_clock_s": round(time.time() - begin, 1)}

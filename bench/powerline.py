@@ -24,7 +24,7 @@ from perch_core import compiled, config, so3
 from perch_core.errors import PlanningRefusal
 from perch_core.rotor_model import P, Q, V
 from perch_core.vehicle import Vehicle, load_vehicle
-from perch_eval.campaign.progress import counted
+from perch_eval.campaign.progress import with_progress
 from perch_eval.node_launch import read_parameters
 from perch_planner.powerline import problem
 from perch_planner.powerline.planner import PowerlinePlanner
@@ -86,7 +86,7 @@ def _answers(vehicle: Vehicle, requests: Iterable[tuple[str, PowerlineRequest]],
     planner = PowerlinePlanner(vehicle, shipped_settings())
     planner.warm_up()
     answers = ({"case": case, "request": request, **_answer(planner, request)} for case, request in requests)
-    return list(counted(answers, total, lambda answer: not answer["refusal"], what="starts"))
+    return list(with_progress(answers, total, lambda answer: not answer["refusal"], unit="starts"))
 
 
 def _of_cases(vehicle: Vehicle, starts: int) -> Iterator[tuple[str, PowerlineRequest]]:
@@ -151,11 +151,11 @@ def _perception() -> list[Figure]:
     for case in ("deg90_perception", "line_80_pa", "line_20_pa"):
         for perception in (True, False):
             planned = problem.plan(problem.load(f"powerline_{case}"), perception=perception, with_recovery=False)
-            seen = visibility(planned.plan.perch.states, planned.request.target(), planned.vehicle.mounts["front"]).summary()
+            summary = visibility(planned.plan.perch.states, planned.request.target(), planned.vehicle.mounts["front"]).summary()
             name = f"{case} {'with' if perception else 'without'}"
             bar = {"bar": 0.99, "comparison": "min >="} if perception and case == "deg90_perception" else {}
-            out += [figure(f"{name}: cheirality", "-", [seen["cheirality_share"]], **bar),
-                    figure(f"{name}: segment visible", "-", [seen["segment_share"]]),
-                    figure(f"{name}: line in image", "-", [seen["seen_share"]]),
-                    figure(f"{name}: |reprojection|", "px", [seen["mean_reprojection_px"]])]
+            out += [figure(f"{name}: cheirality", "-", [summary["cheirality_share"]], **bar),
+                    figure(f"{name}: segment visible", "-", [summary["segment_share"]]),
+                    figure(f"{name}: line in image", "-", [summary["seen_share"]]),
+                    figure(f"{name}: |reprojection|", "px", [summary["mean_reprojection_px"]])]
     return out

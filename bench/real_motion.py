@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from perch_core.vehicle import GRAVITY
 from perch_eval import estimation_flight
-from perch_eval.campaign.progress import counted
+from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.perch_motion import Motion
 from perch_perception.vio import FrameOutcome
@@ -63,10 +63,10 @@ class RealMotion:
         return Motion(times, self._path(times), self._path(times, 1), R, self._turn(times, 1), np.einsum("nji,nj->ni", R, a + (0.0, 0.0, GRAVITY)))
 
 
-def flown(folder: Path) -> dict[str, Any]:
+def evaluate_flights(folder: Path) -> dict[str, Any]:
     """Run all flights with all seeds; return final errors as shares of the path, mean position NEES over 3, lost frames."""
     jobs = [(folder / f"{name}_snapdragon_with_gt.txt", duration, seed) for (name, duration), seed in product(FLIGHTS.items(), SEEDS)]
-    found = dict(counted(in_processes(fly, jobs), len(jobs), what="flights"))
+    found = dict(with_progress(in_processes(fly, jobs), len(jobs), unit="flights"))
     rows = [[found[job] for job in jobs if job[0].name.startswith(f"{name}_")] for name in FLIGHTS]
     return {"flights": [{"flight": name, "path_m": own[0]["path_m"], "error_percent": [100.0 * one["error_m"] / one["path_m"] for one in own],
                          "nees": float(np.mean([one["nees"] for one in own])), "lost": sum(one["lost"] for one in own)}
@@ -82,7 +82,7 @@ def fly(job: tuple[Path, float, int]) -> dict[str, float]:
     world = replace(scenario.world, room=(float(size[0]), float(size[1]), float(motion.high[2]) + BESIDE),
                     room_centre=tuple((0.5 * (motion.low + motion.high))[:2].tolist()))
     scene = replace(build_scene(replace(scenario, world=world), seed), target=None, board=None)
-    flight = estimation_flight.seen(motion, scene, scenario, seed)
+    flight = estimation_flight.sensor_data(motion, scene, scenario, seed)
     steps = estimation_flight.run_vio(flight, level_ground=False)
     posed = [(s.error[:3], s.result.estimate.pose_covariance[:3, :3]) for s in steps if s.error is not None and s.result.estimate is not None]
     return {"path_m": float(np.linalg.norm(np.diff(flight.truth.p_WB, axis=0), axis=1).sum()), "error_m": float(np.linalg.norm(posed[-1][0])),

@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import real_motion
 import recordings_scores as scores
 from perch_core.json_values import finite, write_json
-from perch_core.processes import one_thread_for_sums
+from perch_core.processes import single_threaded_blas
 from perch_eval.evaluation.document import machine, table
-from perch_eval.revision import banner, commit, digest, made_of, root
+from perch_eval.revision import banner, code_version, commit, digest, root
 from recordings_scores import Figures
 
 
@@ -52,7 +52,8 @@ RECORDINGS = {
                        "9 s by hand over gravel and four tags; noise of an MPU-9250's data sheet, gyro bias 0.028 rad/s", (),
                        "[tests/recordings](../../../tests/recordings/README.md), CC0 1.0", scores.photographed_floor),
     "racing": Recording("racing motion, rendered", "the first 13 or 15 s (36 to 41 m) of three flights of UZH-FPV, whose images are not here: ours along "
-                        "their truth, five seeds each", ("rpng/open_vins/ov_data/uzhfpv_indoor",), "of RPG, University of Zurich", real_motion.flown),
+                        "their truth, five seeds each", ("rpng/open_vins/ov_data/uzhfpv_indoor",), "of RPG, University of Zurich",
+                        real_motion.evaluate_flights),
     "nasa": Recording("NASA", "three photographs with 47 reference tags 36h11, all of number 0", ("AprilRobotics/apriltag/test/data",),
                       "CC BY-SA 2.0", scores.nasa),
     "rotation": Recording("rotation series", "15 photographs of one tag, turned by -70 to 70 deg", ("pupil-labs/apriltags/test",),
@@ -81,7 +82,7 @@ ODOMETRY = """
 ATE by `evo`, after alignment; drift and attitude from the start on, with place and heading of the start taken away.
 """
 V101 = """
-At rest a tilt cannot be told from the accelerometer's bias. NEES is that of `sensor.yaml`'s densities, while the idling rotors shake
+At rest a tilt cannot be distinguished from the accelerometer's bias. NEES is that of `sensor.yaml`'s densities, while the idling rotors shake
 the IMU: `perceive.py` warns of it."""
 RACING = """
 **Racing motion, rendered.** UZH-FPV's truth, our camera with errors of calibration as in all our flights, our IMU. Until the take-off the
@@ -105,11 +106,11 @@ paper is not flat. The rotation series is scored with its repository's calibrati
 ## Wires
 
 By length, within 8 px of what is traced (which are a wire's edges). PLDU and PLDM: all photographs of the published test sets, every
-sixth of which was used to choose thresholds. Nobody has traced the street's wires.
+sixth of which was used to choose thresholds. The street's wires are not traced.
 """
 END = """
-In rooms arcs are edges of doors and folds of curtains, on NASA's photographs painted lines. What lies on a surface is told from a wire
-by its motion (`backdrop`), which single photographs do not show. Wires that end at a pole before they cross half of the image are not
+In rooms arcs are edges of doors and folds of curtains, on NASA's photographs painted lines. What lies on a surface is distinguished from a
+wire by its motion (`backdrop`), which single photographs do not show. Wires that end at a pole before they cross half of the image are not
 found."""
 
 
@@ -127,52 +128,52 @@ def motion(f: Figures) -> list[str]:
 
 
 def corners(f: Figures) -> str:
-    """Return the result on NASA's tags in words."""
+    """Return the result on NASA's tags as text."""
     others = f"; {f['others']} more than the reference has" if f["others"] else ""
     return (f"{f['found']} of {f['reference']} found, corners {f['corner_px_median']:.2f} px median "
             f"({f['corner_px_p90']:.2f} px at 90 %){others}")
 
 
 def turns(f: Figures) -> str:
-    """Return the result on the rotation series in words."""
+    """Return the result on the rotation series as text."""
     return (f"{f['poses']} poses; the turn against the photograph at 0 deg is wrong by {f['error_deg_mean']:.2f} deg in the mean, "
             f"{f['error_deg_max']:.1f} deg at most")
 
 
 def grid(f: Figures) -> str:
-    """Return the result on the AprilGrid in words."""
+    """Return the result on the AprilGrid as text."""
     return (f"{', '.join(map(str, f['tags']))} of 36 tags (one photograph cuts the grid), {f['false']} false; on one lens to "
             f"{f['residual_px']:.2f} px")
 
 
 def poses(f: Figures) -> str:
-    """Return the result on the clipboard in words."""
+    """Return the result on the clipboard as text."""
     return (f"position {f['position_percent_rms']:.2f} % rms of the distance, attitude {f['attitude_deg_rms']:.2f} deg rms, "
             f"NEES per dimension {f['nees_mean']:.1f} (median {f['nees_median']:.1f}), {f['poses']} of {f['boards']}; "
             f"residual of the reference {f['reference_px']:.2f} px")
 
 
 def board(f: Figures) -> str:
-    """Return the result on the floor's four tags in words."""
+    """Return the result on the floor's four tags as text."""
     f = f["target"]
     return (f"{f['found']} of {f['images']} images, residual {f['reprojection_rms_px']:.2f} px; the board's place in the map scatters by "
             f"{100 * f['spread_m']:.1f} cm rms")
 
 
 def wires(f: Figures) -> str:
-    """Return the result on photographs with traced wires in words."""
+    """Return the result on photographs with traced wires as text."""
     return (f"precision {f['precision']:.0f} %, recall {f['recall']:.0f} % (without any sixth of the photographs they change by at most "
             f"{f['precision_without_a_sixth']:.1f} and {f['recall_without_a_sixth']:.1f} percentage points)")
 
 
 def page(results: Mapping[str, Figures], command: str) -> list[str]:
     """Lines of README.md; `results`: figures by key of the recording."""
-    def row(key: str, words: Callable[[Figures], str], what: str = "") -> list[str]:
-        return [RECORDINGS[key].title + what, words(results[key]) if key in results else MISSING]
+    def row(key: str, text: Callable[[Figures], str], what: str = "") -> list[str]:
+        return [RECORDINGS[key].title + what, text(results[key]) if key in results else MISSING]
 
-    def pair(key: str, words: Callable[[Figures], str]) -> list[str]:
-        ours, theirs = (results.get(key, {}).get(who) for who in ("ours", "pupil"))
-        return [RECORDINGS[key].title, words(ours) if ours else MISSING, words(theirs) if theirs else "-"]
+    def pair(key: str, text: Callable[[Figures], str]) -> list[str]:
+        ours, theirs = (results.get(key, {}).get(detector) for detector in ("ours", "pupil"))
+        return [RECORDINGS[key].title, text(ours) if ours else MISSING, text(theirs) if theirs else "-"]
 
     def arcs(key: str) -> list[str]:
         return row(key, lambda f: f"{f['ours']['arcs']} arcs in {f['ours']['photographs']} photographs", ", without wires")
@@ -184,7 +185,7 @@ def page(results: Mapping[str, Figures], command: str) -> list[str]:
                  [RECORDINGS[key].title, *(motion(results[key]) if key in results else [MISSING])] for key in ("v101", "floor")))]
     if "v101" in results:
         f = results["v101"]
-        lines += ["", f"On V1_01 the gyro's bias is {math.hypot(*f['gyro_bias']):.3f} rad/s; the drone is seen to rest in "
+        lines += ["", f"On V1_01 the gyro's bias is {math.hypot(*f['gyro_bias']):.3f} rad/s; rest is detected in "
                   f"{f['frames']['RESTING']} of {f['images']['cam0']} frames. The estimator's attitude is wrong by "
                   f"{f['estimator']['attitude_rms_deg']:.2f} deg from the start on.", V101]
     if "racing" in results:
@@ -213,7 +214,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=root() / "docs/results/recordings", metavar="DIR", help="of the page")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    one_thread_for_sums()
+    single_threaded_blas()
     data = arguments.out / "results.json"
     before = json.loads(data.read_text()) if arguments.only and data.is_file() else {}
     results: dict[str, Figures] = before["recordings"] if before.get("digest") == digest() else {}
@@ -230,7 +231,7 @@ def main() -> int:
             results[key] = finite(recording.score(*places))
             print(f"{key}: {json.dumps(results[key])}", flush=True)
     made_by = "python3 bench/recordings.py FOLDER"
-    write_json(data, {**made_of(), "command": made_by, "machine": machine(), "recordings": results})
+    write_json(data, {**code_version(), "command": made_by, "machine": machine(), "recordings": results})
     (arguments.out / "README.md").write_text("\n".join(page(results, made_by)) + "\n")
     return 0
 

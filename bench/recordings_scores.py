@@ -27,8 +27,8 @@ from perch_core.errors import PerchError
 from perch_core.sensors import CalibrationSigmas
 from perch_core.tag_board import Tag, TagBoard, TagGrid, load_board
 from perch_eval.recordings import command
-from perch_eval.recordings.opening import pictures_in
-from perch_eval.recordings.pictures_seen import Seen, find_tags, guessed_mount, look
+from perch_eval.recordings.image_detections import ImageDetections, detect, find_tags, guessed_mount
+from perch_eval.recordings.opening import image_files
 from perch_eval.recordings.recording import decoded, picture
 from perch_perception.line_mapping import LineDetectionConfig, LineSighting
 from perch_perception.tags import BoardLocalizer
@@ -40,7 +40,7 @@ Tags = list[tuple[int, np.ndarray]]
 Figures = dict[str, Any]
 NEAR = 8.0    # a found wire is where the reference has one within this, and the other way round [px]
 WIDTH = 1000  # to which photographs of the AprilGrid are scaled [px]
-INCH = 0.0254  # side of the clipboard's tags; nobody says it, and errors are given as shares of the distance [m]
+INCH = 0.0254  # side of the clipboard's tags; it is not documented, and errors are given as shares of the distance [m]
 ROWS, COLUMNS = 6, 5  # of the clipboard's tags
 TURNED = 180.0  # OpenCV's markers against AprilTag's own [deg]
 PAD = load_board("pad_four_tags")
@@ -49,7 +49,7 @@ PAD = load_board("pad_four_tags")
 # -- recordings with an IMU ------------------------------------------------------------------------------------------
 
 
-def flown(recording: Path, *options: str) -> tuple[Figures, str]:
+def run_perceive(recording: Path, *options: str) -> tuple[Figures, str]:
     """Run `scripts/perceive.py` on a recording; return its `report.json`, without times and text, and `report.html`."""
     with tempfile.TemporaryDirectory() as out:
         if command.main([str(recording), "--out", out, *options]):
@@ -61,7 +61,7 @@ def flown(recording: Path, *options: str) -> tuple[Figures, str]:
 
 def euroc(recording: Path, truth: Path) -> Figures:
     """Score a EuRoC folder against a truth file."""
-    return flown(recording, "--truth", str(truth))[0]
+    return run_perceive(recording, "--truth", str(truth))[0]
 
 
 def photographed_floor(tests: Path, out: Path) -> Figures:
@@ -70,7 +70,7 @@ def photographed_floor(tests: Path, out: Path) -> Figures:
     import photo_flight  # type: ignore[import-not-found]
 
     with tempfile.TemporaryDirectory() as folder:
-        found, page = flown(photo_flight.write_asl(photo_flight.make(9.0), Path(folder) / "floor"))
+        found, page = run_perceive(photo_flight.write_asl(photo_flight.make(9.0), Path(folder) / "floor"))
     for title, name in (("The path", "floor_path"), ("Error and covariance", "floor_error")):
         png = page.partition(f"<h2>{title}</h2>")[2].partition("base64,")[2].partition('"')[0]
         (out / f"{name}.png").write_bytes(base64.b64decode(png))
@@ -88,11 +88,11 @@ def grey(path: Path) -> np.ndarray:
     return pixels
 
 
-def seen(path: Path, mount: CameraMount | None = None, board: TagBoard = PAD) -> Seen:
+def detections_in(path: Path, mount: CameraMount | None = None, board: TagBoard = PAD) -> ImageDetections:
     """Return perceive.py's detections in a photograph; without a mount its camera counts as not calibrated."""
     image = picture(path, 0, "camera", None)
     mounted = mount or guessed_mount("camera", image.width, image.height)
-    return look(image, mounted, board, LineDetectionConfig(appearance="plain"), mount is not None)
+    return detect(image, mounted, board, LineDetectionConfig(appearance="plain"), mount is not None)
 
 
 @cache  # its second detector in a process crashes as it is destroyed
@@ -110,9 +110,9 @@ def ours_of(corners: np.ndarray) -> np.ndarray:
     return corners[[1, 0, 3, 2]] - 0.5
 
 
-def by_both(photographs: list[Path]) -> Iterator[tuple[str, list[Tags], int]]:
+def detect_with_both(photographs: list[Path]) -> Iterator[tuple[str, list[Tags], int]]:
     """Yield detector, tags in each photograph, and total number of wire arcs, which pupil-apriltags does not detect."""
-    views = [seen(path) for path in photographs]
+    views = [detections_in(path) for path in photographs]
     yield "ours", [list(view.tags) for view in views], sum(len(view.wires) for view in views)
     if (search := pupil()) is not None:
         found = [search(grey(path)) for path in photographs]
@@ -123,9 +123,9 @@ def nasa(folder: Path) -> Figures:
     """Score photographs that have text files with AprilTag's unrefined tags, `number, (x y), (x y), (x y), (x y)` per line."""
     photographs, out = sorted(folder.glob("*.jpg")), Figures()
     reference = [[_line(row) for row in path.with_suffix(".txt").read_text().splitlines()] for path in photographs]
-    for who, found, arcs in by_both(photographs):
+    for detector, found, arcs in detect_with_both(photographs):
         errors = [error for tags, true in zip(found, reference) for error in _errors(tags, true)]
-        out[who] = {"photographs": len(photographs), "reference": sum(map(len, reference)), "found": len(errors),
+        out[detector] = {"photographs": len(photographs), "reference": sum(map(len, reference)), "found": len(errors),
                     "others": sum(map(len, found)) - len(errors), "corner_px_median": float(np.median(errors)),
                     "corner_px_p90": float(np.percentile(errors, 90)), "arcs": arcs}
     return out
@@ -148,9 +148,9 @@ def rooms(folder: Path) -> Figures:
     """Score photographs, without wires, whose tags are listed in `groundtruth.txt`: a file and its numbers on each line."""
     lines = [line.split() for line in (folder / "groundtruth.txt").read_text().splitlines()]
     listed, out = [set(map(int, numbers)) for _, *numbers in lines], Figures()
-    for who, found, arcs in by_both([folder / name for name, *_ in lines]):
+    for detector, found, arcs in detect_with_both([folder / name for name, *_ in lines]):
         right = sum(len(true & {number for number, _ in tags}) for tags, true in zip(found, listed))
-        out[who] = {"photographs": len(lines), "reference": sum(map(len, listed)), "found": right,
+        out[detector] = {"photographs": len(lines), "reference": sum(map(len, listed)), "found": right,
                     "false": sum(map(len, found)) - right, "arcs": arcs}
     return out
 
@@ -162,7 +162,7 @@ def rotation(folder: Path) -> Figures:
     mount = CameraMount("camera", camera_of("", about["width"], about["height"], K, np.zeros(0)), np.zeros(3), np.eye(3))
     board = TagBoard((2 * side, 2 * side), (Tag(76, (0.0, 0.0), side),))
     photographs = {int(re.findall(r"-?\d+", name)[-1]): folder / name for name in about["files"]}
-    views = {angle: seen(path, mount, board) for angle, path in photographs.items()}
+    views = {angle: detections_in(path, mount, board) for angle, path in photographs.items()}
     out = {"ours": _turns({angle: view.board.R_CS for angle, view in views.items() if view.board is not None})
            | {"photographs": len(views), "arcs": sum(len(view.wires) for view in views.values())}}
     if (search := pupil()) is not None:
@@ -200,7 +200,7 @@ def calibrated(views: list[Tags], board: TagBoard, size: tuple[int, int]) -> Cal
 def aprilgrid(folder: Path) -> Figures:
     """Score photographs of Kalibr's grid: number of tags in each, and residual of one lens model for all."""
     board = TagBoard((0.75, 0.75), border=2, corner_squares=True, grid=TagGrid(6, 6, 0.088, 0.3, rotation=TURNED))
-    images = [grey(path) for path in pictures_in(folder)]
+    images = [grey(path) for path in image_files(folder)]
     images = [cv2.resize(g, (WIDTH, round(WIDTH / g.shape[1] * g.shape[0])), interpolation=cv2.INTER_AREA) for g in images]
     size = images[0].shape[::-1]
     views = [find_tags(image, guessed_mount("camera", *size).camera, board) for image in images]
@@ -217,7 +217,7 @@ def clipboard_board(steps: np.ndarray, numbers: list[int]) -> TagBoard:
 
 def clipboard(folder: Path) -> Figures:
     """Score poses of eight boards of six random tags (fixed seed) per image, against a calibration from all tags and images."""
-    images = [grey(path) for path in pictures_in(folder)]
+    images = [grey(path) for path in image_files(folder)]
     size, everything, rng = images[0].shape[::-1], list(range(ROWS * COLUMNS)), np.random.default_rng(0)
     views = [find_tags(image, guessed_mount("camera", *size).camera, PAD) for image in images]
     steps = minimize(lambda x: calibrated(views, clipboard_board(x, everything), size).rms, (1.57, 1.57), method="Nelder-Mead",
@@ -247,13 +247,13 @@ def _rms(values: list[float]) -> float:
 
 def street(folder: Path) -> Figures:
     """Count arcs in photographs of wires without a reference."""
-    views = [seen(path) for path in pictures_in(folder)]
+    views = [detections_in(path) for path in image_files(folder)]
     return {"photographs": len(views), "arcs": sum(len(view.wires) for view in views)}
 
 
 def traced(folder: Path) -> Figures:
     """Score photographs in `test` with wire edges traced in `test_gt`: precision and recall by length [%], within NEAR."""
-    lengths = np.array([_lengths(path, folder / "test_gt" / f"{path.stem}.mat") for path in pictures_in(folder / "test")], float)
+    lengths = np.array([_lengths(path, folder / "test_gt" / f"{path.stem}.mat") for path in image_files(folder / "test")], float)
 
     def shares(rows: np.ndarray) -> np.ndarray:
         right, found, covered, wires = rows.sum(axis=0)
@@ -267,7 +267,7 @@ def traced(folder: Path) -> Figures:
 
 def _lengths(photograph: Path, reference: Path) -> tuple[int, int, int, int]:
     """Return lengths in one photograph [px]: correctly found, found, traced and found, traced."""
-    view, edges = seen(photograph), loadmat(str(reference))["groundTruth"][0, 0]["Boundaries"][0, 0] > 0
+    view, edges = detections_in(photograph), loadmat(str(reference))["groundTruth"][0, 0]["Boundaries"][0, 0] > 0
     found = np.zeros(edges.shape, np.uint8)
     for wire in view.wires:
         cv2.polylines(found, [np.round(_arc(wire, view.mount.camera)).astype(np.int32)], False, 1)

@@ -14,14 +14,14 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from harness import Figure, figure
-from machine import LateWakeUps, Stolen, awake, late_with_load
+from machine import LateWakeUps, StolenTime, cores_awake, late_with_load
 from nav_msgs.msg import Odometry
 from perch_core.ros.topics import stamp_of, topic
 from perch_core.trajectory import rest_to_rest
 from perch_core.values import ControllerCommand as Command
 from perch_core.values import TrajectoryOrder, nanoseconds, seconds
 from perch_eval.demo import fly
-from perch_eval.domain import own_domain
+from perch_eval.domain import domain_in_environment
 from perch_eval.nodes import ALL_NODES, CHAIN_NODES, programs
 from perch_eval.ros.graph_node import GraphNode
 from perch_eval.stack import Stack
@@ -48,7 +48,8 @@ class Probe(GraphNode):
         self.diagnostics: dict[str, dict[str, str]] = {}
         for channel in RATES:
             self.node.create_subscription(RATES[channel], channel, partial(self._count, channel), topic(channel).qos.subscribe, raw=True)
-        self._aside = rclpy.create_node("probe_aside", context=self._context)  # read by hand: its executor would not say when a message was sent
+        # read by hand: an executor does not pass on when a message was sent
+        self._aside = rclpy.create_node("probe_aside", context=self._context)
         self._newest = {channel: self._aside.create_subscription(RATES[channel], channel, print, topic(channel).qos.subscribe, raw=True)
                         for channel in ("imu/data_raw", "motor_command")}
         diagnostics = topic("/diagnostics")
@@ -90,13 +91,13 @@ class Probe(GraphNode):
     def take_off(self) -> None:
         """Wait for the estimate, arm, and fly to a hover at 1 m."""
         self.spin_until(lambda: self.diagnostics.get("estimator", {}).get("state") == "RUNNING", 10.0)
-        self.listen(2.0)
+        self.spin_for(2.0)
         self.order("controller/command", Command(self.stamp, ARM, "bench"))
-        self.listen(0.2)
+        self.spin_for(0.2)
         begin = self.stamp + nanoseconds(0.2)
         climb = rest_to_rest(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 2.0, start_time=seconds(begin))
         self.order("trajectory", TrajectoryOrder(1, climb))
-        self.listen(4.0)
+        self.spin_for(4.0)
         assert self.diagnostics["controller"]["state"] == "HOVERING", self.diagnostics["controller"]
 
     def close(self) -> None:
@@ -108,12 +109,12 @@ class Probe(GraphNode):
 @contextmanager
 def running(scenario: Scenario, folder: Path, **options) -> Iterator[tuple[Probe, Stack]]:
     """Run a stack and a probe; yield both when the stack is ready and stepping."""
-    with own_domain(), Stack(programs(scenario, folder=folder, **options), folder) as stack, closing(Probe()) as probe:
+    with domain_in_environment(), Stack(programs(scenario, folder=folder, **options), folder) as stack, closing(Probe()) as probe:
         stack.wait_until_ready(probe.visible_nodes)
         for _ in range(600):
             if probe.time > 2.0:  # one second of flight
                 break
-            probe.listen(0.1)
+            probe.spin_for(0.1)
             stack.raise_if_ended()
         yield probe, stack
 
@@ -126,17 +127,17 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
     """
     where = f"real time, {law}" + ("" if composed else ", one process per node")
     overrides = {"vehicle": {"cameras": "none"}, "controller": {"controller.type": law}}
-    with awake(), running(scenario, folder, lockstep=False, composed=composed, overrides=overrides) as (probe, stack):
+    with cores_awake(), running(scenario, folder, lockstep=False, composed=composed, overrides=overrides) as (probe, stack):
         probe.take_off()
         counts_of = (("vehicle", "deadlines_missed", "steps"), ("vehicle", "commands_missed", "steps"),
                      ("estimator", "missed_deadlines", "deadlines"), ("controller", "missed_deadlines", "deadlines"))
         before = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
         delays = []
-        rates, machine, host, used = {topic: [] for topic in RATES}, LateWakeUps(), Stolen(), processor_time(stack)
+        rates, machine, host, used = {topic: [] for topic in RATES}, LateWakeUps(), StolenTime(), processor_time(stack)
         for _ in range(windows):
             counts = dict(probe.counts)
             delays += probe.delays()
-            span = probe.listen(WINDOW)
+            span = probe.spin_for(WINDOW)
             for topic in RATES:
                 rates[topic].append((probe.counts[topic] - counts[topic]) / span)
         late, stolen, used = machine.share(), host.share(), processor_time(stack) - used
@@ -152,7 +153,7 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
             figure(f"{where}: bare timer beside it late by a period", "% of steps", [late]),
             figure(f"{where}: processor time that the host took away", "% of all cores", [stolen])]
     if composed:
-        with awake():
+        with cores_awake():
             same = late_with_load(load, windows * WINDOW)
         out.append(figure(f"{where}: loop of as much processor time late by a period", "% of steps", [same]))
     return [*out, figure(f"{where}: command after its IMU sample, from publication to publication", "us", delays,
@@ -175,7 +176,7 @@ def lockstep(scenario: Scenario, folder: Path, windows: int, composed: tuple[str
 
 def _factor(probe: Probe) -> float:
     begin = probe.time
-    span = probe.listen(WINDOW)
+    span = probe.spin_for(WINDOW)
     return (probe.time - begin) / span
 
 

@@ -23,8 +23,8 @@ def main() -> int:
     kinds = sorted(path.stem for path in (ROOT / "tests" / "fuzzing").glob("*.py") if "\ndef run(" in path.read_text())
     parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("kind", choices=kinds, help="of inputs")
-    parser.add_argument("--minutes", type=float, default=1.0, help="of hunting (default: %(default)g)")
-    parser.add_argument("--seed", type=int, default=1, help="of the changes (default: %(default)s)")
+    parser.add_argument("--minutes", type=float, default=1.0, help="of the search (default: %(default)g)")
+    parser.add_argument("--seed", type=int, default=1, help="of the mutations (default: %(default)s)")
     parser.add_argument("--cases", type=Path, default=ROOT / "tests" / "fuzz" / "cases", metavar="DIR",
                         help="where inputs that are found are kept (default: tests/fuzz/cases)")
     arguments = parser.parse_args()
@@ -35,10 +35,10 @@ def main() -> int:
     with quiet_on_interrupt():
         from fuzzing.report import Report
 
-        hunt = importlib.import_module(f"fuzzing.{arguments.kind}")
+        fuzzer = importlib.import_module(f"fuzzing.{arguments.kind}")
     report = Report(arguments.kind, arguments.minutes, arguments.cases)
     try:
-        hunt.run(arguments.minutes, arguments.seed, report)
+        fuzzer.run(arguments.minutes, arguments.seed, report)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
     print(f"{report.line().strip()}; {len(report.problems)} problems")

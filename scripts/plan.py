@@ -58,10 +58,10 @@ def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool) -> i
             print(f"{name} of {part.duration:.3f} s; {part.solver}, {part.iterations} iterations in {1e3 * part.solve_time:.0f} ms")
     for bound in planned.plan.bounds:
         print(f"  {bound}")
-    seen = written.get("visibility")
-    if seen is not None:
-        print(f"line in front {100 * seen['cheirality_share']:.0f} %, its segment at the centre {100 * seen['segment_share']:.0f} %, "
-              f"in the image {100 * seen['seen_share']:.0f} % of the perch; mean |reprojection| {seen['mean_reprojection_px']:.0f} px")
+    summary = written.get("visibility")
+    if summary is not None:
+        print(f"line in front {100 * summary['cheirality_share']:.0f} %, its segment at the centre {100 * summary['segment_share']:.0f} %, "
+              f"in the image {100 * summary['seen_share']:.0f} % of the perch; mean |reprojection| {summary['mean_reprojection_px']:.0f} px")
     print("written: " + ", ".join(written["files"]))
     return 0
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 
-from perch_setup import ROOT, become, command_parser, enter, quiet_on_interrupt
+from perch_setup import ROOT, command_parser, enter, exec_program, quiet_on_interrupt
 
 EXAMPLES = """examples:
   python3 scripts/run_node.py vehicle
@@ -44,7 +44,7 @@ def main() -> int:
         return 2
     file = ROOT / "config" / f"{arguments.node}.yaml"
     with_file = ["--ros-args", "--params-file", str(file), "--"] if file.exists() and not arguments.no_config else []
-    become(path, [path, *with_file, *for_node])
+    exec_program(path, [path, *with_file, *for_node])
 
 
 if __name__ == "__main__":

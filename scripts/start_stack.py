@@ -53,7 +53,7 @@ def command_line() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Run the script; return 0 if stopped by the caller, 1 if a node ended by itself, 2 for the caller's mistake."""
+    """Run the script; return 0 if stopped by the caller, 1 if a node ended by itself, 2 if its input is refused."""
     parser = command_line()
     arguments = parser.parse_args()
     if arguments.domain is not None and not 0 <= arguments.domain <= 101:
@@ -78,7 +78,7 @@ def main() -> int:
         run(arguments)
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1 if isinstance(error, StackError) and not error.callers_mistake else 2
+        return 1 if isinstance(error, StackError) and not error.refused_input else 2
     except KeyboardInterrupt:
         print("stopped", flush=True)
         return 0
@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> None:
     from perch_eval.nodes import node_programs, sharing
     from perch_eval.stack import Stack
     from perch_eval.view.gate import check_free
-    from ros_graph.connection import visit
+    from ros_graph.connection import connect
 
     open_network(arguments.network)
     source = config.find("scenarios", arguments.scenario).resolve()
@@ -113,17 +113,17 @@ def run(arguments: argparse.Namespace) -> None:
             check_free(str(viewer.get("host", "127.0.0.1")), arguments.view)
     nodes = choose_nodes(scenario, arguments.only, arguments.without, ("viewer",) if arguments.view is not None else ())
     launches = node_launches(scenario, nodes, seed=arguments.seed, scenario_source=str(source), lockstep=not arguments.realtime, overrides=overrides)
-    folder = output_folder((arguments.log_dir or own_folder()).absolute(), "--log-dir")
+    folder = output_folder((arguments.log_dir or default_log_folder()).absolute(), "--log-dir")
     programs = node_programs(launches, folder, namespace=arguments.namespace, composed=sharing(arguments.composed))
     with Stack(programs, folder, on_line=printer([program.name for program in programs])) as stack:
-        with visit() as graph:
+        with connect() as graph:
             stack.wait_until_ready(graph.visible_nodes, arguments.ready_timeout)
         print(f"ready in ROS domain {os.environ['ROS_DOMAIN_ID']}: {', '.join(nodes)}. Logs: {folder}. Ctrl-C stops all.", flush=True)
         stack.wait()
         stack.raise_if_ended()
 
 
-def own_folder() -> Path:
+def default_log_folder() -> Path:
     """Return the default log folder; it has the process id, as several stacks may start in the same second."""
     return ROOT / "out" / "stack" / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}"
 

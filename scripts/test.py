@@ -24,7 +24,7 @@ PARTS = (
 """The longest parts, which start first; files and folders of one part share expensive fixtures. Each other file is a part."""
 PROCESSES = 1 + min(os.cpu_count() or 1, 5)
 """One more than cores (at most 6), as some tests wait for clocks or processes; with two more, real-time tests starve."""
-KEPT = ROOT / ".perch" / "pycache"
+PYCACHE = ROOT / ".perch" / "pycache"
 
 EXAMPLES = """examples:
   python3 scripts/test.py                        all tests
@@ -36,13 +36,13 @@ EXAMPLES = """examples:
 
 
 def main() -> int:
-    """Run pytest; 0 all passed, 1 some failed, 2 the caller's mistake."""
+    """Run pytest; 0 all passed, 1 some failed, 2 wrong arguments."""
     parser = command_parser(__doc__, EXAMPLES, allow_abbrev=False)
     parser.add_argument("--quick", action="store_true", help="only the unit tests that fly, draw and start nothing")
     parser.add_argument("--fast", action="store_true", help="skip tests/system")
     arguments, for_pytest = parser.parse_known_args()
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # as tests/conftest.py does, and says why
-    os.environ.setdefault("PYTHONPYCACHEPREFIX", str(KEPT))
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # as in tests/conftest.py, for the reason given there
+    os.environ.setdefault("PYTHONPYCACHEPREFIX", str(PYCACHE))
     enter(*EXTRAS)
     return run_tests(arguments.quick, arguments.fast, for_pytest)
 
@@ -59,8 +59,8 @@ def run_tests(quick: bool, fast: bool, for_pytest: list[str]) -> int:
     processes = PROCESSES - 1 if quick else PROCESSES  # quick tests wait for nothing
     if not fast and not for_pytest and PROCESSES > 2:
         print(f"{processes} processes share the tests; what the others print comes at the end", flush=True)
-        share = Share(parts(test_files()), processes)
-        share.end(run_pytest([*chosen, "-o", "console_output_style=classic"], share, *() if quick else (Beforehand(),)))
+        workers = WorkerPlugin(parts(test_files()), processes)
+        workers.end(run_pytest([*chosen, "-o", "console_output_style=classic"], workers, *() if quick else (ForkServerPlugin(),)))
     return run_pytest([*chosen, *for_pytest])
 
 
@@ -72,7 +72,7 @@ def run_pytest(arguments: list[str], *plugins: object) -> int:
     return {0: 0, 1: 1}.get(int(code), 2 if code == pytest.ExitCode.USAGE_ERROR else 1)
 
 
-class Beforehand:
+class ForkServerPlugin:
     """Pytest plugin that starts the fork servers of scripts and nodes while tests are collected, when a core is idle."""
 
     def pytest_sessionstart(self) -> None:
@@ -82,18 +82,18 @@ class Beforehand:
         forks(NODES), forks(SCRIPTS)
 
 
-class Share:
+class WorkerPlugin:
     """Pytest plugin that forks processes after the collection of tests; each takes the next part when it has finished one."""
 
     def __init__(self, parts: list[tuple[str, ...]], processes: int) -> None:
         self._parts, self._processes = parts, processes
-        self._left, numbers = os.pipe()  # of the parts that nobody has taken
+        self._left, numbers = os.pipe()  # of the parts that are not yet taken
         os.write(numbers, b"".join(number.to_bytes(2, "big") for number in range(len(parts))))
         os.close(numbers)
         self._others: list[tuple[int, IO[str]]] = []  # process ids, and what they print
         self._forked = False
 
-    def take(self) -> tuple[str, ...] | None:
+    def next_part(self) -> tuple[str, ...] | None:
         """Files and folders of the next part; None where all are taken."""
         number = os.read(self._left, 2)
         return self._parts[int.from_bytes(number, "big")] if number else None
@@ -103,15 +103,15 @@ class Share:
         if session.testsfailed:
             raise session.Interrupted(f"{session.testsfailed} files could not be collected")
         sys.stdout.flush()
-        gc.freeze()  # what is not looked through is not copied
+        gc.freeze()  # memory that the collector does not traverse is not copied
         while len(self._others) < self._processes - 1:
             output = tempfile.TemporaryFile("w+", errors="replace")
             if (pid := os.fork()) == 0:
-                become_another(session.config, output)
+                set_up_worker(session.config, output)
                 self._others, self._forked = [], True
                 break
             self._others.append((pid, output))
-        while (part := self.take()) is not None:
+        while (part := self.next_part()) is not None:
             items = [item for item in session.items if any(within(name, item.nodeid.split("::")[0]) for name in part)]
             for item, following in zip(items, [*items[1:], None]):
                 item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
@@ -138,7 +138,7 @@ class Share:
         os._exit(code)
 
 
-def become_another(config, output: IO[str]) -> None:
+def set_up_worker(config, output: IO[str]) -> None:
     """Set up a forked test process: own ROS domain and output; pytest's cache is written by the first process only."""
     from perch_core.processes import end_with_parent
     from perch_eval.domain import free_domain

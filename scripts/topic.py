@@ -49,7 +49,7 @@ def command_line() -> argparse.ArgumentParser:
 
 def _add_topic(command: argparse.ArgumentParser) -> None:
     command.add_argument("topic")
-    command.add_argument("type", nargs="?", help="its type; by default the graph is asked")
+    command.add_argument("type", nargs="?", help="its type (default: from the graph)")
 
 
 if __name__ == "__main__":

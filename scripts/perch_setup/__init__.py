@@ -3,8 +3,9 @@
 Only the standard library is used here, because nothing else is installed when this code first runs.
 """
 
-from .enter import become, command_parser, enter, leave_quietly_on_interrupt, quiet_on_interrupt, run, setting_up
+from .enter import command_parser, enter, exec_program, leave_quietly_on_interrupt, quiet_on_interrupt, run, setting_up
 from .layout import EXTRAS, ROOT
 from .prepare import prepare
 
-__all__ = ["EXTRAS", "ROOT", "become", "command_parser", "enter", "leave_quietly_on_interrupt", "prepare", "quiet_on_interrupt", "run", "setting_up"]
+__all__ = ["EXTRAS", "ROOT", "command_parser", "enter", "exec_program", "leave_quietly_on_interrupt", "prepare", "quiet_on_interrupt", "run",
+           "setting_up"]

@@ -44,7 +44,7 @@ def enter(*extras: str) -> None:
     environment[_ENTERED] = str(os.getpid())
     sys.stdout.flush()
     sys.stderr.flush()
-    become(str(VENV_PYTHON), [str(VENV_PYTHON), *sys.argv], environment)
+    exec_program(str(VENV_PYTHON), [str(VENV_PYTHON), *sys.argv], environment)
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def setting_up() -> Iterator[None]:
         sys.exit(INTERRUPTED)
 
 
-def become(path: str, arguments: list[str], environment: Mapping[str, str] = os.environ) -> NoReturn:
+def exec_program(path: str, arguments: list[str], environment: Mapping[str, str] = os.environ) -> NoReturn:
     """Replace this process by another program. Ctrl-C is blocked until our code runs, as Python would show a traceback."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.execve(path, arguments, environment)

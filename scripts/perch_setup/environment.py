@@ -12,18 +12,18 @@ from .machine import Platform
 _OURS = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH", "PYTHONPATH", "PYTHONHOME")
 
 
-def variables(wanted: Platform, with_workspace: bool = True) -> dict[str, str]:
+def variables(target: Platform, with_workspace: bool = True) -> dict[str, str]:
     """Return the variables of `source setup.bash`, on top of the caller's variables.
 
     Args:
-        wanted: where ROS comes from. With our wheels, leftovers of other workspaces are dropped;
+        target: where ROS comes from. With our wheels, leftovers of other workspaces are dropped;
             with an installation they belong to it and are kept.
         with_workspace: whether the built packages are part of it.
 
     Raises:
         SetupError: sourcing fails.
     """
-    start = {key: value for key, value in os.environ.items() if not (wanted.uses_wheels and key in _OURS)}
+    start = {key: value for key, value in os.environ.items() if not (target.uses_wheels and key in _OURS)}
     start["PERCH_WITHOUT_WORKSPACE"] = "" if with_workspace else "1"
     script = 'source "$1" >&2 && exec env -0'
     answer = subprocess.run(["bash", "--norc", "-c", script, "bash", SETUP_BASH], env=start, capture_output=True)

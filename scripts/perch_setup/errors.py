@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-CALLERS_MISTAKE = 2
+USAGE_ERROR = 2
 FAILED = 1
 
 
@@ -14,6 +14,6 @@ class SetupError(Exception):
         exit_code: 2 where the machine or the call has to change, 1 where a step failed.
     """
 
-    def __init__(self, message: str, exit_code: int = CALLERS_MISTAKE) -> None:
+    def __init__(self, message: str, exit_code: int = USAGE_ERROR) -> None:
         super().__init__(message)
         self.exit_code = exit_code

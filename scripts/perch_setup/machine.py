@@ -62,10 +62,10 @@ def detect_platform(environment: Mapping[str, str] = os.environ) -> Platform:
     if distribution:
         raise SetupError(f"ROS 2 {distribution} is sourced in this shell, perch needs {DISTRIBUTION}: "
                          f"run 'source /opt/ros/{DISTRIBUTION}/setup.bash' in a new shell, or open a shell without any ROS and perch brings its own")
-    return INSTALLED if _remembered_installation() else WHEELS
+    return INSTALLED if _installation_exists() else WHEELS
 
 
-def remember(chosen: Platform, environment: Mapping[str, str] = os.environ) -> None:
+def record_installation(chosen: Platform, environment: Mapping[str, str] = os.environ) -> None:
     """Record which installation was used, for `setup.bash` and for later starts."""
     if chosen.uses_wheels:
         ROS_PREFIX.unlink(missing_ok=True)
@@ -82,7 +82,7 @@ def _sourced_prefix(environment: Mapping[str, str]) -> Optional[Path]:
     return found[-1] if found else None
 
 
-def _remembered_installation() -> bool:
+def _installation_exists() -> bool:
     """Return whether the installation of an earlier set-up still exists."""
     try:
         return Path(ROS_PREFIX.read_text(), "setup.bash").exists()
@@ -90,7 +90,7 @@ def _remembered_installation() -> bool:
         return False
 
 
-def check_python(wanted: Platform, version: Sequence[int] = sys.version_info[:2]) -> None:
+def check_python(target: Platform, version: Sequence[int] = sys.version_info[:2]) -> None:
     """Check that the lock files fit this Python, operating system and processor.
 
     Raises:
@@ -104,7 +104,7 @@ def check_python(wanted: Platform, version: Sequence[int] = sys.version_info[:2]
         raise SetupError(f"Python {found} is not supported: perch needs Python {known}{advice}")
     if sys.platform != "linux":
         raise SetupError(f"{sys.platform} is not supported: perch runs on Linux")
-    if wanted.uses_wheels and platform.machine() != "x86_64":
+    if target.uses_wheels and platform.machine() != "x86_64":
         raise SetupError(f"there are no ROS wheels for {platform.machine()} processors, only for x86_64: "
                          "install ROS 2 Jazzy (Ubuntu 24.04) and source /opt/ros/jazzy/setup.bash first")
 

@@ -7,9 +7,9 @@ import sys
 import time
 from typing import Callable, Mapping, Optional, Sequence
 
-from .alone import held
 from .errors import FAILED, SetupError
 from .layout import STATE
+from .lock import descriptors
 
 _TAIL = 15
 _QUIET_PERIOD_S = 10.0
@@ -54,7 +54,7 @@ class Step:
         lines: list[str] = []
         with file.open("w") as sink, subprocess.Popen(
                 [str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, text=True,
-                errors="replace", env=dict(environment), pass_fds=held()) as process:
+                errors="replace", env=dict(environment), pass_fds=descriptors()) as process:
             try:
                 for line in process.stdout or ():
                     sink.write(line)
@@ -63,7 +63,7 @@ class Step:
                     if detail:
                         self.show(detail)
             except KeyboardInterrupt:
-                _let_finish(process)
+                _wait_or_kill(process)
                 raise
         if process.returncode:
             shown = "\n".join(f"    {line}" for line in lines)
@@ -79,7 +79,7 @@ class Step:
         sys.stderr.flush()
 
 
-def _let_finish(process: subprocess.Popen) -> None:
+def _wait_or_kill(process: subprocess.Popen) -> None:
     """Wait for a tool to end after Ctrl-C, which it received as well; kill it after a time-out."""
     try:
         process.wait(timeout=5.0)

@@ -15,13 +15,13 @@ _FILE = STATE / "stamps.json"
 _BUILD_FILES = ("package.xml", "setup.py", "setup.cfg", "CMakeLists.txt")
 
 
-def environment_stamp(wanted: Platform) -> str:
+def environment_stamp(target: Platform) -> str:
     """Return a stamp that changes whenever the virtual environment has to be installed again.
 
     The Python that runs this is not part of it, as an environment keeps the one it was made with.
     """
-    mending = (Path(__file__).with_name(name) for name in ("wheel_paths.py", "slim.py"))
-    return _digest((*wanted.locks, *mending), wanted.ros, str(ROOT))
+    repairs = (Path(__file__).with_name(name) for name in ("wheel_paths.py", "slim.py"))
+    return _digest((*target.locks, *repairs), target.ros, str(ROOT))
 
 
 def extra_stamp(extra: str, environment: str) -> str:
@@ -47,12 +47,12 @@ def kernel_stamp(environment: str) -> str:
     return _digest(files, environment)
 
 
-def packages(wanted: Platform) -> list[Path]:
+def packages(target: Platform) -> list[Path]:
     """Return the folders of all packages to build; those of ROS itself only if the sourced installation lacks them.
 
     With our wheels, sourced packages are ignored, as they may be those of another checkout of perch.
     """
-    sourced = "" if wanted.uses_wheels else os.environ.get("AMENT_PREFIX_PATH", "")
+    sourced = "" if target.uses_wheels else os.environ.get("AMENT_PREFIX_PATH", "")
     prefixes = [Path(prefix) for prefix in sourced.split(os.pathsep) if prefix and not prefix.startswith(str(ROOT))]
     return sorted(file.parent for file in SOURCES.glob("*/package.xml")
                   if file.parent.name.startswith("perch_") or not any((prefix / "share" / file.parent.name).is_dir() for prefix in prefixes))
@@ -75,9 +75,9 @@ def save(stamps: dict[str, str]) -> None:
     draft.replace(_FILE)
 
 
-def _digest(files: Iterable[Path], *words: str) -> str:
-    """SHA-256 over words, and over names and contents of files."""
-    digest = hashlib.sha256("\0".join(words).encode())
+def _digest(files: Iterable[Path], *texts: str) -> str:
+    """SHA-256 over texts, and over names and contents of files."""
+    digest = hashlib.sha256("\0".join(texts).encode())
     for file in files:
         digest.update(f"\0{file.relative_to(ROOT)}\0".encode())
         digest.update(file.read_bytes())

@@ -13,42 +13,42 @@ from .layout import EXTRAS, STATE, VENV, VENV_PYTHON
 from .machine import Platform
 from .progress import Step
 from .slim import slim
-from .wheel_paths import mend_wheels
+from .wheel_paths import repair_wheels
 
 _UNFINISHED = STATE / "installing"
 """Marker file that exists until pip is done. A killed venv leaves a Python without pip, a killed pip leaves broken packages."""
 _USER_SETTINGS = ("PIP_TARGET", "PIP_PREFIX", "PIP_REQUIRE_VIRTUALENV", "PYTHONHOME", "PYTHONSTARTUP")
 
 
-def install(wanted: Platform, fresh: bool) -> None:
+def install(target: Platform, fresh: bool) -> None:
     """Install the locked versions into the virtual environment.
 
     Args:
-        wanted: where ROS comes from, and the lock files.
+        target: where ROS comes from, and the lock files.
         fresh: start from an empty environment, as for another source of ROS or a moved checkout.
 
     Raises:
         SetupError: a tool fails.
     """
-    environment = _environment(wanted)
+    environment = _environment(target)
     STATE.mkdir(exist_ok=True)
     fresh = fresh or not usable()
     _UNFINISHED.touch()
     if fresh:
         with Step("virtual environment") as step:
             shutil.rmtree(VENV, ignore_errors=True)
-            sight = [] if wanted.uses_wheels else ["--system-site-packages"]
+            access = [] if target.uses_wheels else ["--system-site-packages"]
             outside = getattr(sys, "_base_executable", "") or sys.executable  # of any virtual environment: ours has just been removed
-            step.run([outside, "-m", "venv", *sight, VENV], "venv", environment)
-    total = sum(_pins(lock.read_text()) for lock in wanted.locks)
+            step.run([outside, "-m", "venv", *access, VENV], "venv", environment)
+    total = sum(_pins(lock.read_text()) for lock in target.locks)
     with Step(f"installing {total} packages") as step:
-        _pip(step, environment, total, *wanted.locks)
-        if wanted.uses_wheels:
-            mend_wheels(VENV)
+        _pip(step, environment, total, *target.locks)
+        if target.uses_wheels:
+            repair_wheels(VENV)
     _UNFINISHED.unlink()
 
 
-def install_extra(wanted: Platform, extra: str) -> None:
+def install_extra(target: Platform, extra: str) -> None:
     """Install the packages of an extra into the virtual environment.
 
     Raises:
@@ -59,7 +59,7 @@ def install_extra(wanted: Platform, extra: str) -> None:
     unfinished.touch()
     total = _pins(EXTRAS[extra].read_text())
     with Step(f"installing {total} extra package{'s' * (total != 1)} ({extra})") as step:
-        _pip(step, _environment(wanted), total, EXTRAS[extra], options=again)
+        _pip(step, _environment(target), total, EXTRAS[extra], options=again)
     unfinished.unlink()
 
 
@@ -70,7 +70,7 @@ def _pip(step: Step, environment: Mapping[str, str], total: int, *locks: Path, o
     """
     pip = [VENV_PYTHON, "-m", "pip", "install", "--no-deps", "--no-compile", "--progress-bar", "off", "--no-input"]
     quiet = ["--disable-pip-version-check", "--no-warn-script-location"]
-    step.run([*pip, *quiet, *options, *(word for lock in locks for word in ("-r", str(lock)))], "pip", environment, _narrator(total))
+    step.run([*pip, *quiet, *options, *(word for lock in locks for word in ("-r", str(lock)))], "pip", environment, _progress_parser(total))
     for packages in VENV.glob("lib/python3.*/site-packages"):
         slim(packages)
 
@@ -80,11 +80,11 @@ def usable() -> bool:
     return VENV_PYTHON.exists() and (VENV_PYTHON.parent / "activate").exists() and not _UNFINISHED.exists()
 
 
-def _environment(wanted: Platform) -> dict[str, str]:
+def _environment(target: Platform) -> dict[str, str]:
     """Return the caller's environment without variables that interfere with pip."""
     environment = {key: value for key, value in os.environ.items() if key not in _USER_SETTINGS}
     environment.update(PIP_USER="0", PYTHONNOUSERSITE="1")
-    if wanted.uses_wheels:
+    if target.uses_wheels:
         environment.pop("PYTHONPATH", None)
         environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
     return environment
@@ -95,7 +95,7 @@ def _pins(lock: str) -> int:
     return len(re.findall(r"^[a-zA-Z0-9]", lock, re.MULTILINE))
 
 
-def _narrator(total: int) -> Callable[[str], Optional[str]]:
+def _progress_parser(total: int) -> Callable[[str], Optional[str]]:
     """Return a function that turns pip's lines into a count."""
     count = 0
 

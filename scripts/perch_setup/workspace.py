@@ -16,12 +16,12 @@ _COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
 """Colcon is started by our Python, so that the executables that it writes run in our Python as well."""
 
 
-def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
+def build(selected: Iterable[Path], target: Platform, fresh: bool) -> None:
     """Build packages with links to their sources, so that edits of Python files are live.
 
     Args:
         selected: folders of the packages to build.
-        wanted: where ROS comes from.
+        target: where ROS comes from.
         fresh: remove everything that was built before.
 
     Raises:
@@ -39,12 +39,12 @@ def build(selected: Iterable[Path], wanted: Platform, fresh: bool) -> None:
             *("--packages-select", *names),
             *("--cmake-args", "-DCMAKE_BUILD_TYPE=Release", "--no-warn-unused-cli"),
         ]
-        step.run(command, "build", _environment(wanted), _narrated)
+        step.run(command, "build", _environment(target), _progress)
 
 
-def _environment(wanted: Platform) -> dict[str, str]:
+def _environment(target: Platform) -> dict[str, str]:
     """Return the environment variables for colcon, CMake and the generators."""
-    environment = variables(wanted, with_workspace=False)
+    environment = variables(target, with_workspace=False)
     environment["PYTHONNOUSERSITE"] = "1"
     environment["PWD"] = str(ROOT)
     # CMake asks for `python3` in several ways; all of them end at ours.
@@ -52,7 +52,7 @@ def _environment(wanted: Platform) -> dict[str, str]:
     return environment
 
 
-def _narrated(line: str) -> Optional[str]:
+def _progress(line: str) -> Optional[str]:
     """Return the progress in a line of colcon: the name of a package that begins, or make's percentage of a message package."""
     started = re.match(r"Starting >>> (\S+)", line)
     percentage = re.match(r"\[ *(\d+)%\] .*?\b(\w+?_msgs)", line)  # several packages are built at the same time

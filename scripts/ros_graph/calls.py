@@ -10,7 +10,7 @@ from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit
+from ros_graph.connection import GraphConnection
 from ros_graph.messages import fill, interface, parse, to_yaml
 
 _STATUS = {
@@ -20,7 +20,7 @@ _STATUS = {
 }
 
 
-def call_service(graph: Visit, arguments: argparse.Namespace) -> int:
+def call_service(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `service.py call`: print the response; return 1 if it has `success: false`, otherwise 0."""
     cls = interface(arguments.type, "srv")
     request = fill(cls.Request(), parse(arguments.values, "request"))
@@ -33,7 +33,7 @@ def call_service(graph: Visit, arguments: argparse.Namespace) -> int:
     return 0 if getattr(response, "success", True) else 1
 
 
-def send_goal(graph: Visit, arguments: argparse.Namespace) -> int:
+def send_goal(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `action.py send_goal`: return 0 if the goal succeeds, otherwise 1. Ctrl-C cancels the goal."""
     cls = interface(arguments.type, "action")
     goal = fill(cls.Goal(), parse(arguments.values, "goal"))
@@ -59,7 +59,7 @@ def send_goal(graph: Visit, arguments: argparse.Namespace) -> int:
     return 0 if outcome.status == GoalStatus.STATUS_SUCCEEDED else 1
 
 
-def _result(graph: Visit, handle: ClientGoalHandle):
+def _result(graph: GraphConnection, handle: ClientGoalHandle):
     """Wait for the goal's result, without time-out; after Ctrl-C, for that of the cancelled goal."""
     result = handle.get_result_async()
     try:

@@ -9,7 +9,7 @@ import sys
 
 from perch_setup import command_parser, enter
 
-CALLERS_MISTAKE = 2
+USAGE_ERROR = 2
 INTERRUPTED = 130
 
 
@@ -33,7 +33,7 @@ class Commands:
 
         Args:
             name: on the command line.
-            handler: `module:function` in this package, imported inside the environment only; takes `Visit` and arguments.
+            handler: `module:function` in this package, imported inside the environment only; takes `GraphConnection` and arguments.
             about: its help text.
         """
         command = self._verbs.add_parser(name, help=about)
@@ -77,15 +77,15 @@ def carry_out(command_line: argparse.ArgumentParser) -> int:
 
     module, function = arguments.handler.split(":")
     try:
-        from ros_graph.connection import visit
+        from ros_graph.connection import connect
 
-        with visit() as graph:
+        with connect() as graph:
             code = getattr(importlib.import_module(f"ros_graph.{module}"), function)(graph, arguments)
         sys.stdout.flush()
         return code
     except (GraphError, PerchError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return CALLERS_MISTAKE
+        return USAGE_ERROR
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:  # `topic.py echo ... | head`

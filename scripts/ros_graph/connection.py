@@ -21,7 +21,7 @@ _SETTLED_S = 0.7
 """Discovery counts as finished when nothing new has appeared for this time [s]."""
 
 
-class Visit(GraphNode):
+class GraphConnection(GraphNode):
     """A hidden node, with methods to wait for answers."""
 
     def __init__(self) -> None:
@@ -39,27 +39,27 @@ class Visit(GraphNode):
 
     def settle(self, observe: Callable[[], T], timeout: float) -> T:
         """Return an observation of the graph once it has settled, at the latest after `timeout` [s]."""
-        seen, since = observe(), time.monotonic()
+        observed, since = observe(), time.monotonic()
         end = since + timeout
 
         def settled() -> bool:
-            nonlocal seen, since
+            nonlocal observed, since
             now = observe()
-            if now != seen:
-                seen, since = now, time.monotonic()
+            if now != observed:
+                observed, since = now, time.monotonic()
             return time.monotonic() - since > _SETTLED_S or time.monotonic() > end
 
         self.spin_until(settled)
-        return seen
+        return observed
 
     def absolute(self, name: str) -> str:
         """Return a name as an absolute one."""
         return name if name.startswith("/") else f"/{name}"
 
 
-def visit() -> AbstractContextManager[Visit]:
+def connect() -> AbstractContextManager[GraphConnection]:
     """Join the graph with a hidden node, and leave it again."""
-    return closing(Visit())
+    return closing(GraphConnection())
 
 
 def hidden(name: str) -> bool:
@@ -67,7 +67,7 @@ def hidden(name: str) -> bool:
     return any(part.startswith("_") for part in name.split("/"))
 
 
-def list_names(graph: Visit, arguments: argparse.Namespace) -> int:
+def list_names(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `list`: print the names of a kind that are not hidden, with their types if requested (`-t`)."""
     observe = {"topics": Node.get_topic_names_and_types, "services": Node.get_service_names_and_types,
                "actions": get_action_names_and_types}[arguments.kind]

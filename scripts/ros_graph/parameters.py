@@ -12,13 +12,13 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit, hidden
+from ros_graph.connection import GraphConnection, hidden
 
 TYPES = {getattr(ParameterType, f"PARAMETER_{kind.upper().replace(' ', '_')}"): kind for kind in (
     "bool", "integer", "double", "string", "byte array", "bool array", "integer array", "double array", "string array")}
 
 
-def list_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
+def list_parameters(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `param.py list`, of one node or of all."""
     nodes = [graph.absolute(arguments.node)] if arguments.node else _nodes(graph, arguments.spin_time)
     for node in nodes:
@@ -28,7 +28,7 @@ def list_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
     return 0
 
 
-def get_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
+def get_parameter(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `param.py get`."""
     node, client = _node(graph, arguments)
     value = _values(graph, client, node, [arguments.parameter])[0]
@@ -39,7 +39,7 @@ def get_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
     return 0
 
 
-def describe_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
+def describe_parameters(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `param.py describe`: print meaning, type, unit and allowed values of parameters."""
     node, client = _node(graph, arguments)
     names = [arguments.parameter] if arguments.parameter else _names(graph, client, node)
@@ -68,7 +68,7 @@ def _allowed(descriptor: ParameterDescriptor) -> str:
     return ", ".join(parts)
 
 
-def set_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
+def set_parameter(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `param.py set`: return 1 if the node refuses the value, otherwise 0."""
     value = parse_yaml(arguments.value, "value")
     node, client = _node(graph, arguments)
@@ -90,7 +90,7 @@ def set_parameter(graph: Visit, arguments: argparse.Namespace) -> int:
     return 0
 
 
-def dump_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
+def dump_parameters(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `param.py dump`: print the parameters as a parameter file."""
     node, client = _node(graph, arguments)
     names = _names(graph, client, node)
@@ -101,31 +101,31 @@ def dump_parameters(graph: Visit, arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _node(graph: Visit, arguments: argparse.Namespace) -> tuple[str, AsyncParameterClient]:
+def _node(graph: GraphConnection, arguments: argparse.Namespace) -> tuple[str, AsyncParameterClient]:
     """Return the full name of the command line's node, and a client of its parameters."""
     name = graph.absolute(arguments.node)
     return name, _client(graph, name, arguments.spin_time)
 
 
-def _nodes(graph: Visit, timeout: float) -> list[str]:
+def _nodes(graph: GraphConnection, timeout: float) -> list[str]:
     return sorted(name for name in graph.settle(graph.nodes, timeout) if not hidden(name))
 
 
-def _client(graph: Visit, node: str, timeout: float) -> AsyncParameterClient:
+def _client(graph: GraphConnection, node: str, timeout: float) -> AsyncParameterClient:
     client = AsyncParameterClient(graph.node, node)
     if not graph.spin_until(client.services_are_ready, timeout):
         raise GraphError(f"node {node} does not exist or has no parameters; nodes: {', '.join(_nodes(graph, 1.0))}")
     return client
 
 
-def _names(graph: Visit, client: AsyncParameterClient, node: str) -> list[str]:
+def _names(graph: GraphConnection, client: AsyncParameterClient, node: str) -> list[str]:
     return sorted(graph.answer(client.list_parameters([], 0), node).result.names)
 
 
-def _values(graph: Visit, client: AsyncParameterClient, node: str, names: list[str]) -> list[Any]:
+def _values(graph: GraphConnection, client: AsyncParameterClient, node: str, names: list[str]) -> list[Any]:
     values = list(graph.answer(client.get_parameters(names), node).values)
-    if len(values) != len(names):  # how a node says that it does not know one of them
-        raise GraphError(f"{node} does not know {', '.join(names)}; 'param.py list' shows all")
+    if len(values) != len(names):  # the response of a node that lacks one of them
+        raise GraphError(f"{node} does not have {', '.join(names)}; 'param.py list' shows all")
     return values
 
 

@@ -14,13 +14,13 @@ from typing import Any
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ros_graph.commands import GraphError
-from ros_graph.connection import Visit
+from ros_graph.connection import GraphConnection
 from ros_graph.messages import fill, interface, parse, pick, to_yaml
 
 REPORT_PERIOD = 1.0  # of `hz` [s]
 
 
-def show_info(graph: Visit, arguments: argparse.Namespace) -> int:
+def show_info(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `topic.py info`."""
     topic = graph.absolute(arguments.topic)
     name = topic_type(graph, topic, arguments.spin_time)
@@ -33,15 +33,15 @@ def show_info(graph: Visit, arguments: argparse.Namespace) -> int:
     return 0
 
 
-def echo(graph: Visit, arguments: argparse.Namespace) -> int:
+def echo(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `topic.py echo`."""
-    wanted = 1 if arguments.once else arguments.n or math.inf
+    limit = 1 if arguments.once else arguments.n or math.inf
     shown = 0
     problem: list[Exception] = []
 
     def show(message: Any) -> None:
         nonlocal shown
-        if problem or shown >= wanted:
+        if problem or shown >= limit:
             return
         try:
             value = pick(message, arguments.field) if arguments.field else message
@@ -52,16 +52,16 @@ def echo(graph: Visit, arguments: argparse.Namespace) -> int:
         shown += 1
 
     _subscribe(graph, arguments, show)
-    graph.spin_until(lambda: problem or shown >= wanted)
+    graph.spin_until(lambda: problem or shown >= limit)
     if problem:
         raise problem[0]
     return 0
 
 
-def measure_rate(graph: Visit, arguments: argparse.Namespace) -> int:
+def measure_rate(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `topic.py hz`: print the rate every second; with `-n`, end after that number of messages."""
     arrivals: deque[float] = deque(maxlen=max(arguments.window, 2))
-    wanted, count, reported = arguments.n or math.inf, 0, 0
+    limit, count, reported = arguments.n or math.inf, 0, 0
 
     def arrived(_: bytes) -> None:
         nonlocal count
@@ -69,8 +69,8 @@ def measure_rate(graph: Visit, arguments: argparse.Namespace) -> int:
         arrivals.append(time.monotonic())
 
     _subscribe(graph, arguments, arrived, raw=True)  # counting does not need the content of an image
-    while count < wanted:
-        finished = graph.spin_until(lambda: count >= wanted, REPORT_PERIOD)
+    while count < limit:
+        finished = graph.spin_until(lambda: count >= limit, REPORT_PERIOD)
         print(rate_summary(list(arrivals)) if count > reported or finished else "no new messages", flush=True)
         reported = count
     return 0
@@ -93,7 +93,7 @@ def rate_summary(arrivals: Sequence[float]) -> str:
     )
 
 
-def publish(graph: Visit, arguments: argparse.Namespace) -> int:
+def publish(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `topic.py pub`."""
     message = fill(interface(arguments.type, "msg")(), parse(arguments.values, "message"))
     topic = graph.absolute(arguments.topic)
@@ -110,7 +110,7 @@ def publish(graph: Visit, arguments: argparse.Namespace) -> int:
     return 0
 
 
-def topic_type(graph: Visit, topic: str, timeout: float) -> str:
+def topic_type(graph: GraphConnection, topic: str, timeout: float) -> str:
     """Return the name of a topic's type, as soon as the topic exists in the graph.
 
     Raises:
@@ -126,7 +126,7 @@ def topic_type(graph: Visit, topic: str, timeout: float) -> str:
     return types[0]
 
 
-def _subscribe(graph: Visit, arguments: argparse.Namespace, callback: Callable[[Any], None], raw: bool = False) -> None:
+def _subscribe(graph: GraphConnection, arguments: argparse.Namespace, callback: Callable[[Any], None], raw: bool = False) -> None:
     """Subscribe to the topic of the command line with QoS compatible with its publishers; its type is given or from the graph."""
     cls = interface(arguments.type or topic_type(graph, arguments.topic, arguments.spin_time), "msg")
     topic = graph.absolute(arguments.topic)
@@ -139,7 +139,7 @@ def _subscribe(graph: Visit, arguments: argparse.Namespace, callback: Callable[[
     graph.node.create_subscription(cls, topic, callback, profile, raw=raw)
 
 
-def _sides(graph: Visit, topic: str) -> dict[str, list[str]]:
+def _sides(graph: GraphConnection, topic: str) -> dict[str, list[str]]:
     return {
         "Publisher": [_describe(e) for e in graph.node.get_publishers_info_by_topic(topic)],
         "Subscription": [_describe(e) for e in graph.node.get_subscriptions_info_by_topic(topic)],

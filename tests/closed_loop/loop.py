@@ -119,8 +119,8 @@ class Loop:
         self.run(PERIOD)
         self.flight.vehicle.command = None
         rotors = RotorEstimate(tuple(plant.speed.tolist()), tuple(plant.speed.tolist()))
-        hovering = entered(flight.flown, State.HOVERING, "in the air")._replace(rotors=rotors)
-        flight.flown = following(hovering, Hold.at(plant.p, (0.0, 1.0, 0.0)))
+        hovering = entered(flight.flight_state, State.HOVERING, "in the air")._replace(rotors=rotors)
+        flight.flight_state = following(hovering, Hold.at(plant.p, (0.0, 1.0, 0.0)))
         self.run(0.3)
 
     def take_off(self, height: float = 1.2) -> None:

@@ -48,14 +48,14 @@ class SupervisedLoop(FirmwareLoop):
         radio: the pilot's channels [us]: sticks, arming, level, hand-over to the companion computer.
         cut: commands do not reach the supervisor.
         severed: nothing reaches the firmware's serial port.
-        heard: time of the last command that has reached it [s].
+        last_command: time of the last command that has reached it [s].
         aimed: what the motors aim at, (4,) [rad/s].
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
         super().__init__(vehicle)
         self.severed = False
-        self.radio, self.cut, self.heard = [1500, 1500, 1000, 1500, OFF, OFF, ON], False, 0.0
+        self.radio, self.cut, self.last_command = [1500, 1500, 1000, 1500, OFF, OFF, ON], False, 0.0
         self.watchdog = LateWatchdog(self.sticks.throttle_for(1.0), self.sticks.throttle_for(DESCENT), curves=self.sticks.curves[:2])
         self._node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._node.setblocking(False)
@@ -69,7 +69,7 @@ class SupervisedLoop(FirmwareLoop):
 
     def command(self, now, armed, rates, thrust):
         if not (self.cut or self._killed or self.severed):
-            self.heard = now / NANOSECONDS
+            self.last_command = now / NANOSECONDS
             self._node.send(b"C" + COMMAND.pack(armed, *self.sticks.channels(rates, thrust)))
 
     def kill(self) -> None:

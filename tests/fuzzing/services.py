@@ -25,7 +25,8 @@ from perch_core.isolated import IsolatedRunner
 from perch_core.ros import topics
 from perch_core.trajectory import FlatSample, FlatTrajectory, SampledTrajectory
 from perch_core.values import (
-    Ask, ChooseLaw, MappedPowerline, PerchGoal, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest, seconds)
+    MappedPowerline, PerchGoal, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest, SetControllerRequest, TriggerRequest,
+    seconds)
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from fuzzing import messages, sense
 from fuzzing.messages import Nonsense
@@ -249,7 +250,7 @@ def ask_mission(rng: random.Random) -> str:
         if rng.random() < 0.3:
             answers: list[Any] = []
             busy = flown()
-            one.call("on_depart", (Ask(), answers.append))
+            one.call("on_depart", (TriggerRequest(), answers.append))
             if busy != bool(answers):
                 raise Nonsense(f"depart while {'a goal is flown' if busy else 'nothing is flown'}: {answers}")
             if not busy:
@@ -276,12 +277,12 @@ def ask_controller(task: str, rng: random.Random) -> str:
     controller, answers, outcome = one.component, [], "taken"
     if task == "set_controller":
         kind = rng.choice(("geometric", "nmpc", "", "pid", "x" * 10_000, "geometric\x00", "GEOMETRIC"))
-        one.call("on_set_controller", (ChooseLaw(kind, rng.random() < 0.5), answers.append))
+        one.call("on_set_controller", (SetControllerRequest(kind, rng.random() < 0.5), answers.append))
         if len(answers) != 1 or answers[0].success != (answers[0].error_code == 0) or (answers[0].success and kind not in ("geometric", "nmpc")):
             raise Nonsense(f"{kind[:20]!r}: {answers}")
         outcome = "taken" if answers[0].success else "refused"
     elif task == "abort":
-        one.call("on_abort", (Ask(), answers.append))
+        one.call("on_abort", (TriggerRequest(), answers.append))
         if len(answers) != 1:
             raise Nonsense(f"{len(answers)} answers to an abort")
     else:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from perch_core.component import Action, Client, Component, Input, Service, Wake, ports
+from perch_core.component import Action, Client, Component, Input, Service, Timer, ports
 from perch_sim.timing import CONTROL_PERIOD
 from perch_core.values import CameraImage
 from perch_eval.goal import goal_of
@@ -92,7 +92,7 @@ def recorded(flight: str) -> dict[str, tuple[Event, ...]]:
 
 def _tap(one: Component[Any], events: list[Event]) -> None:
     """Keep what comes to a component."""
-    kinds = (Input, Wake, Service, Client, Action)
+    kinds = (Input, Timer, Service, Client, Action)
     for port in (port for kind in kinds for port in ports(type(one), kind)):
         method = f"on_{port.name}"
 

@@ -19,8 +19,8 @@ from perch_core.rotor_model import RotorModel
 from perch_core.values import Certificate
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline.certificate import certify, certify_end
-from perch_planner.powerline.flight import fly
-from perch_planner.powerline.formulation import OURS
+from perch_planner.powerline.flight import simulate
+from perch_planner.powerline.formulation import DEFAULT
 from perch_planner.powerline.request import PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 
@@ -73,9 +73,9 @@ class Oracle:
             except RuntimeError:  # IPOPT met an invalid number
                 continue
             duration, rates = self._inputs(np.array(answer["x"]).ravel())
-            times, states, dense = fly(RotorModel.of(self.vehicle), request.start, rates, duration)
+            times, states, dense = simulate(RotorModel.of(self.vehicle), request.start, rates, duration)
             bounds = (*certify(self.vehicle, times, states, dense, request.lines, self.settings.height_min, thrust_max),
-                      *certify_end(times, states, request.perch, *OURS.accuracy))
+                      *certify_end(times, states, request.perch, *DEFAULT.accuracy))
             if all(bound.holds for bound in bounds):
                 return Found(duration, rates, bounds, number)
         return None

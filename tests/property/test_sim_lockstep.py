@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Wake
+from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Timer
 from perch_core.errors import PerchError
 from perch_core.values import CameraImage
 from perch_sim.lockstep import Answer, Arrival, LocalParticipant, Owed, Packet, Schedule, Task, local_servers
@@ -105,7 +105,7 @@ class Controller(Component[Nothing]):
 class Mission(Component[Nothing]):
     odometry, line = Input(tuple, "odometry"), Input(int, "powerlines")
     trajectory = Output(int, "trajectory")
-    tick = Wake(0.02)
+    tick = Timer(0.02)
 
     def __init__(self) -> None:
         super().__init__(Nothing())
@@ -123,7 +123,7 @@ class Mission(Component[Nothing]):
 
 class Mapper(Component[Nothing]):
     powerlines = Output(int, "powerlines")
-    look = Wake(0.05)
+    look = Timer(0.05)
 
     def on_look(self, now: int) -> None:
         self.powerlines(now)
@@ -347,7 +347,7 @@ class Asking(Component[Nothing]):
     number, said = Input(int, "number"), Output(str, "said")
     plan = Client(int, int, "plan_perch")
     perch = Action(int, int, int, "perch")
-    tick = Wake(0.02)
+    tick = Timer(0.02)
 
     def on_number(self, number):
         self.plan(number, number)
@@ -462,7 +462,7 @@ def test_a_batch_that_is_cut_short_is_refused():
 
 class Failing(Component[Nothing]):
     number, said = Input(int, "number"), Output(str, "said")
-    tick = Wake(0.02)
+    tick = Timer(0.02)
 
     def on_number(self, number):
         self.said(f"{12 // number}")

@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_eval import modelled_sight_node
-from perch_eval.modelled_sight_node import blind_launches
+from perch_eval.modelled_sight_node import imageless_launches
 from perch_eval.nodes import ALL_NODES, node_programs
 from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_msgs.msg import ControllerStatus
@@ -91,7 +91,7 @@ class Rig:
         source.write_text(scenario)
         self.scenario = load_scenario(source)
         self._lines, self._came = [], threading.Lock()
-        launches = blind_launches(self.scenario, 1, str(source), lockstep, overrides={"mission": {"lockstep_hold": "perch"}} if lockstep else {})
+        launches = imageless_launches(self.scenario, 1, str(source), lockstep, overrides={"mission": {"lockstep_hold": "perch"}} if lockstep else {})
         together = [name for name in ALL_NODES if name not in (*alone, *modelled_sight_node.NODES)]
         started = node_programs(launches, folder, composed=together)
         self._programs = {program.name: program for program in started}

@@ -49,6 +49,6 @@ rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
 node, executor = Stranger(), SingleThreadedExecutor()
 executor.add_node(node)
 print("up", flush=True)
-stop.patient = True
+stop.defer = True
 while not stop:
     executor.spin_once(timeout_sec=0.1)

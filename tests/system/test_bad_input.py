@@ -51,7 +51,7 @@ SCENARIOS = {
     "infinite": ("start: {position: [.inf, 0.0, 0.0]}", "start.position: inf is outside [-10000, 10000] m"),
     "outside the room": ("target: {bearing_deg: 60.0, distance: 3.2}", "is outside the room"),
     "too far above": ("target: {height: 3.9, distance: 3.3}", "outside [0.8, 3.6] m that the camera reads"),
-    "above the image": ("target: {height: 3.9, distance: 0.8}", "deg that the front camera sees"),
+    "above the image": ("target: {height: 3.9, distance: 0.8}", "deg of the front camera's view"),
     "seen from behind": ("target: {height: 3.0, inclination_deg: 0.0}", "in which its tags can be read"),
     "unknown vehicle": ("vehicle: snapdragn", "vehicle: 'snapdragn': unknown; there are: betaflight, "),
     "unknown board": ("target: {board: no_pad}", "target.board: 'no_pad': unknown; there are: pad_four_tags"),

@@ -90,7 +90,7 @@ def test_the_recording_opens_as_ros_2_messages(flight):
 def test_the_page_is_complete(flight):
     report, folder = flight
     page = (folder / "report.html").read_text()
-    for title in ("Timeline", "Tracking and estimation", "Body rates", "Thrust against its bounds", "What the cameras saw", "Rates", "Times"):
+    for title in ("Timeline", "Tracking and estimation", "Body rates", "Thrust against its bounds", "Camera images", "Rates", "Times"):
         assert f"<h2>{title}" in page
     assert page.count("data:image/png;base64,") == 5 and page.count("data:image/webp;base64,") == 1
     assert report["flight_hash"][:16] in page and "attached to pad" in page
@@ -100,7 +100,7 @@ def test_the_page_is_complete(flight):
 @pytest.fixture
 def crowd(ros_domain, tmp_path, monkeypatch) -> Iterator[list[forks.Forked]]:
     """A foreign publisher on every topic, a viewer and two who measure rates, in the domain that the next demo flies in."""
-    monkeypatch.setattr(demo, "own_domain", lambda: contextlib.nullcontext(ros_domain))
+    monkeypatch.setattr(demo, "domain_in_environment", lambda: contextlib.nullcontext(ros_domain))
     topic = str(ROOT / "scripts" / "topic.py")
     with (tmp_path / "crowd.log").open("w+") as log:
         everybody = [forks.Forked(forks.NODES, [str(Path(__file__).with_name("stranger.py"))], log, log),

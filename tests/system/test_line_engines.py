@@ -10,7 +10,7 @@ from contextlib import closing
 
 import pytest
 from perch_eval import modelled_sight_node
-from perch_eval.domain import own_domain
+from perch_eval.domain import domain_in_environment
 from perch_eval.in_process import FlightTrace, fly
 from perch_eval.nodes import ALL_NODES, node_programs
 from perch_eval.ros.mission_client import FlightResult, MissionClient
@@ -28,11 +28,11 @@ def flights(tmp_path_factory) -> tuple[FlightResult, RecordedFlight, FlightTrace
     """Result and recording of a flight on the real nodes, and the same without ROS."""
     folder, scenario = tmp_path_factory.mktemp("line"), load_scenario(SCENARIO)
     overrides = {"mission": {"lockstep_hold": "perch"}, "recorder": {"file": str(folder / "flight.mcap")}}
-    launches = modelled_sight_node.blind_launches(scenario, SEED, SCENARIO, True, extra=("recorder",), overrides=overrides)
+    launches = modelled_sight_node.imageless_launches(scenario, SEED, SCENARIO, True, extra=("recorder",), overrides=overrides)
     programs = node_programs(launches, folder, composed=set(ALL_NODES) - set(modelled_sight_node.NODES))
-    with own_domain(), Stack(modelled_sight_node.blind_programs(programs), folder) as stack, closing(MissionClient()) as pilot:
+    with domain_in_environment(), Stack(modelled_sight_node.imageless_programs(programs), folder) as stack, closing(MissionClient()) as pilot:
         stack.wait_until_ready(pilot.visible_nodes, PATIENCE)
-        result = pilot.fly(scenario, check=stack.raise_if_ended, stall=PATIENCE)
+        result = pilot.fly(scenario, check=stack.raise_if_ended, stall_timeout=PATIENCE)
         pilot.linger(LINGER, stack.raise_if_ended, PATIENCE)
     return result, RecordedFlight(folder / "flight.mcap"), fly(scenario, SEED, linger=LINGER)
 

@@ -40,7 +40,7 @@ def test_in_lockstep_they_take_their_places_and_it_perches(tmp_path):
 
         above = replace(flight.scenario, mission=replace(flight.scenario.mission, takeoff_height=3.0), time_limit=200.0)
         lost = flight.fly(acts(), above)  # a climb that takes a while
-        assert str(lost) in ("the mission was restarted: the goal is lost", "the mission has ended: the goal is lost"), lost
+        assert str(lost) in ("the mission was restarted: its goal was dropped", "the mission has ended: its goal was dropped"), lost
         result = flight.fly(iter(()))
         assert result.outcome == "perched", result.message
 

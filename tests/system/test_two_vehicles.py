@@ -30,9 +30,9 @@ def vehicle(namespace: str, folder: Path) -> Iterator[tuple[Stack, MissionClient
     """The nodes of a flight without images and with a recorder, in lockstep, and who sends the goal."""
     folder.mkdir()
     overrides = {"mission": {"lockstep_hold": "perch"}, "recorder": {"file": str(folder / "flight.mcap")}}
-    launches = modelled_sight_node.blind_launches(load_scenario(SCENARIO), SEEDS[namespace], SCENARIO, True, extra=("recorder",), overrides=overrides)
+    launches = modelled_sight_node.imageless_launches(load_scenario(SCENARIO), SEEDS[namespace], SCENARIO, True, extra=("recorder",), overrides=overrides)
     programs = node_programs(launches, folder, namespace=namespace, composed=set(ALL_NODES) - set(modelled_sight_node.NODES))
-    with Stack(modelled_sight_node.blind_programs(programs), folder) as stack:
+    with Stack(modelled_sight_node.imageless_programs(programs), folder) as stack:
         pilot = MissionClient(namespace)
         try:
             yield stack, pilot
@@ -42,7 +42,7 @@ def vehicle(namespace: str, folder: Path) -> Iterator[tuple[Stack, MissionClient
 
 def flown(stack: Stack, pilot: MissionClient) -> FlightResult:
     """From the goal to its end."""
-    result = pilot.fly(load_scenario(SCENARIO), check=stack.raise_if_ended, stall=PATIENCE)
+    result = pilot.fly(load_scenario(SCENARIO), check=stack.raise_if_ended, stall_timeout=PATIENCE)
     pilot.linger(LINGER, stack.raise_if_ended, PATIENCE)
     return result
 

@@ -327,7 +327,7 @@ def test_preflight_sees_whether_the_pilot_takes_over(vehicle, switched):
     listener = object.__new__(GraphListener)
     listener.values = {channel: [] for channel in CHANNELS}
 
-    def listen(duration):
+    def spin_for(duration):
         last = time.monotonic() + duration
         while time.monotonic() < last:
             node.on_rates_thrust(order := RatesThrust(0, True, STILL, 9.81))
@@ -339,7 +339,7 @@ def test_preflight_sees_whether_the_pilot_takes_over(vehicle, switched):
                 vehicle.radio[6], vehicle.radio[4] = OFF, OFF
             time.sleep(0.005)
 
-    listener.listen = listen
+    listener.spin_for = spin_for
     try:
         node.on_rates_thrust(RatesThrust(0, False, STILL, 9.81))
         assert listener.await_takeover(10.0 if switched else 4.0) == (True, True if switched else None)
@@ -455,7 +455,7 @@ def body():
     ((0, 1, 0), 85.0, 6.5), ((0.6, 0.8, 0), 60.0, 4.0)])
 def test_a_body_is_level_a_third_of_a_second_after_the_last_command(body, axis, tilt, rate):
     body.found(axis, tilt, rate)
-    last, told, above = body.loop.heard, None, 0.0
+    last, told, above = body.loop.last_command, None, 0.0
     body.loop.kill()
     while body.time < last + 1.0:
         body.step(True, (5.0, 0.0, 0.0))
@@ -469,7 +469,7 @@ def test_a_body_is_level_a_third_of_a_second_after_the_last_command(body, axis, 
 def test_a_link_that_is_cut_is_followed_again_when_it_is_back(body):
     """However long it was cut, and each time."""
     for gap in (0.05, 0.2, 1.0, 3.0):
-        last, body.loop.cut, modes = body.loop.heard, True, []
+        last, body.loop.cut, modes = body.loop.last_command, True, []
         while body.time < last + gap:
             body.step(True)
             modes.append((body.time - last, body.loop.watchdog.mode))
@@ -484,7 +484,7 @@ def test_a_link_that_is_cut_is_followed_again_when_it_is_back(body):
 
 
 def test_without_commands_motors_are_off_after_four_seconds_and_stay_so(body):
-    last, body.loop.cut = body.loop.heard, True
+    last, body.loop.cut = body.loop.last_command, True
     while body.loop.aimed.any():
         body.step(True)
         assert body.time < last + 4.1

@@ -51,7 +51,7 @@ def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "time", SimpleNamespace(monotonic=lambda: next(clock)))  # of this module alone: others read it, too
     monkeypatch.setattr(machine, "os", SimpleNamespace(cpu_count=lambda: 2, sysconf=lambda name: 100))
     stat.write_text("cpu  1 2 3 4 5 6 7 500 0 0\ncpu0 1 2 3 4 5 6 7 250 0 0\n")
-    stolen = machine.Stolen(stat)
+    stolen = machine.StolenTime(stat)
     stat.write_text("cpu  9 9 9 9 9 9 9 520 0 0\ncpu0 1 2 3 4 5 6 7 270 0 0\n")
     assert stolen.share() == pytest.approx(1.0)  # 0.2 s of 10 s of two cores
 
@@ -59,7 +59,7 @@ def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):
 def test_spinning_processes_end_with_a_bench_that_was_killed():
     code = """
 import machine, multiprocessing, time
-with machine.awake():
+with machine.cores_awake():
     print(*[p.pid for p in multiprocessing.active_children()], flush=True)
     time.sleep(60)
 """

@@ -80,10 +80,10 @@ LADDER = "\n".join(f"a{k}: &a{k} [{f'*a{k - 1}' if k else 'x'}]" for k in range(
 @pytest.mark.parametrize("content, words", [
     (DEEP, "line 1: more than 20 levels"), ("{a: " * 2000, "line 1: more than 20 levels"), ("- " * 2000, "more than 20 levels"),
     (LADDER, "more than 20 levels"), (BOMB, "more than 20000 values"), ("&a [*a]", "alias 'a' has no anchor before it"),
-    ("name: a\nname: b", "line 2: key 'name' stands here twice"), ("{name: a, inner: {gain: 1, gain: 2}}", "key 'gain' stands here twice"),
-    ("? [a]\n: b", "a key that is no word"), ("!!python/object/apply:os.system [ls]", "tags are not used"), ("!!timestamp x", "tags are not used"),
+    ("name: a\nname: b", "line 2: duplicate key 'name'"), ("{name: a, inner: {gain: 1, gain: 2}}", "duplicate key 'gain'"),
+    ("? [a]\n: b", "a key that is not a scalar"), ("!!python/object/apply:os.system [ls]", "tags are not used"), ("!!timestamp x", "tags are not used"),
     (f"[{'1, ' * 3000}]", "more than 2000 entries"),
-    (f"count: {'9' * 400}", "a whole number beyond 64 bits"), (f"# {'x' * (1 << 20)}", "more than 1048576 bytes"),
+    (f"count: {'9' * 400}", "an integer beyond 64 bits"), (f"# {'x' * (1 << 20)}", "more than 1048576 bytes"),
     ("--- a\n--- b", "is not valid YAML"), ("a: \x00", "is not valid YAML"), ("<<: 3", "is not valid YAML"),
 ])
 def test_what_must_not_be_built_is_refused_while_it_is_read(tmp_path, content, words):

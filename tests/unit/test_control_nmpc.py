@@ -205,7 +205,7 @@ def test_rotors_that_are_led_anew_in_every_period_are_late_by_less_than_the_lead
 
 def test_the_law_that_stands_in_keeps_the_pace_of_the_odometry():
     law = predictive(RPG)
-    law.pace(0.004)
+    law.set_period(0.004)
     assert law.fallback.period == 0.004
     law.retune(law.settings, GeometricController(RPG, ControlGains()))
     assert law.fallback.period == 0.004
@@ -242,10 +242,10 @@ def test_laws_switch_in_flight_without_a_jump():
     loop.run(0.8)
     flight, law = loop.controller, predictive()
     for following in (law, GeometricController(SNAPDRAGON, ControlGains()), law):
-        before = np.array(flight.flown.rotors.command)
+        before = np.array(flight.flight_state.rotors.command)
         flight.use(following, flight.gains, flight.settings)
         loop.run(0.002)
-        after = np.array(flight.flown.rotors.command)
+        after = np.array(flight.flight_state.rotors.command)
         assert np.abs(after - before).max() < 0.15 * before.max()
         loop.run(0.2)
     loop.run(1.5)
@@ -309,5 +309,5 @@ def test_interpreted_linearisation_flies_the_same(monkeypatch):
     for law in (slow, fast):
         loop = make_loop(law=law)
         loop.begin_in_hover()
-        speeds.append(loop.controller.flown.rotors.command)
+        speeds.append(loop.controller.flight_state.rotors.command)
     np.testing.assert_allclose(speeds[0], speeds[1], rtol=1e-6)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from perch_control.admission import AtEnd, Order
-from perch_control.smooth_position import FARTHEST, SmoothPosition
+from perch_control.smooth_position import CORRECTION_MAX, SmoothPosition
 
 CONTACT = 3.0
 
@@ -18,7 +18,7 @@ def flown(correction, at: float, at_end: AtEnd = AtEnd.RECOVER, recovery_start: 
         time = 0.002 * k
         p, v = np.array([np.sin(time), 0.5 * time**2, 1.0]), np.array([np.cos(time), time, 0.0])
         seen = p + np.array(correction) * (time >= at)
-        state = smooth.of(time, (*seen.tolist(), *v.tolist(), 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), order if time >= 1.0 else None)
+        state = smooth.state(time, (*seen.tolist(), *v.tolist(), 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), order if time >= 1.0 else None)
         off.append(np.array(state[:3]) - p)
     return np.array(off)
 
@@ -36,13 +36,13 @@ def test_elsewhere_the_odometry_is_believed(case):
 
 
 def test_odometry_that_was_wrong_altogether_is_believed():
-    np.testing.assert_allclose(flown([0.0, 0.0, 2.0 * FARTHEST], CONTACT - 0.1)[-1], [0.0, 0.0, 2.0 * FARTHEST], atol=1e-5)
+    np.testing.assert_allclose(flown([0.0, 0.0, 2.0 * CORRECTION_MAX], CONTACT - 0.1)[-1], [0.0, 0.0, 2.0 * CORRECTION_MAX], atol=1e-5)
 
 
 def test_the_next_trajectory_is_flown_on_the_odometry_as_it_is():
     smooth, seen = SmoothPosition(), (0.0,) * 6 + (0.0, 0.0, 0.0, 1.0) + (0.0,) * 3
     moved = (0.02,) + seen[1:]
     for time, sample in ((2.9, seen), (2.902, seen), (2.904, moved)):
-        state = smooth.of(time, sample, Order(1, None, 1.0, AtEnd.RECOVER, 0.25, 2.0))
+        state = smooth.state(time, sample, Order(1, None, 1.0, AtEnd.RECOVER, 0.25, 2.0))
     assert state[0] == 0.0
-    assert smooth.of(2.906, moved, Order(1, None, 2.9, AtEnd.HOLD))[0] == 0.02
+    assert smooth.state(2.906, moved, Order(1, None, 2.9, AtEnd.HOLD))[0] == 0.02

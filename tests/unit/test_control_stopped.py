@@ -15,7 +15,7 @@ from perch_control.modes import Command, State
 from perch_control.recovery import Recovery
 from perch_control.reference import SampledReference
 from perch_core.trajectory import rest_to_rest
-from perch_core.values import Ask
+from perch_core.values import TriggerRequest
 from perch_planner.problem import PerchSettings
 from unit.controller_flight import Flight, hovering, parameters
 from unit.test_control_supervisor import along_x, hovering as hovering_loop, leaving, moved, ready
@@ -32,7 +32,7 @@ def waiting(flight: Flight, end=(1.0, 0.0, 0.6)) -> Flight:
 
 
 def abort(flight: Flight) -> None:
-    flight.component.on_abort(Ask(), lambda done: None)
+    flight.component.on_abort(TriggerRequest(), lambda done: None)
 
 
 @pytest.mark.parametrize("stop", [
@@ -106,7 +106,7 @@ def test_a_landing_leaves_a_trajectory_by_its_planned_way_out():
     ready(loop, start, start + 0.6)
     loop.run(0.3)
     loop.controller.command(Command.LAND, "low battery")
-    assert loop.controller.state is State.TRACKING and "low battery; planned recovery in" in loop.controller.flown.message
+    assert loop.controller.state is State.TRACKING and "low battery; planned recovery in" in loop.controller.flight_state.message
     with pytest.raises(TrajectoryRefused, match="about to be left"):
         loop.follow(perch("surface_90_1.7m").trajectory, AtEnd.CONTACT, id=9)
     loop.run(0.4)
@@ -128,7 +128,7 @@ def test_a_hover_at_the_ground_is_a_landing():
 
 def continuation(loop, start: float, ahead: float = 0.0) -> Order:
     """The rest of the plan of `leaving`, from `ahead` seconds later on."""
-    now = loop.controller.flown.now + ahead
+    now = loop.controller.flight_state.now + ahead
     return Order(8, SampledReference(along_x(now, 0.4 * (now - start), 0.4, 2.5), loop.controller.vehicle.mass), now, AtEnd.RECOVER, 0.25, 1.6)
 
 
@@ -158,7 +158,7 @@ def test_a_perch_may_begin_in_the_brake_at_the_end_of_a_move():
     p = loop.plant.p.copy()
     loop.follow(rest_to_rest(p, p + [0.5, 0.0, 0.0], 0.0, 0.0, 1.0))
     loop.run(1.1)
-    assert loop.controller.state is State.HOVERING and loop.controller.flown.elapsed < loop.controller.flown.source.duration
+    assert loop.controller.state is State.HOVERING and loop.controller.flight_state.elapsed < loop.controller.flight_state.source.duration
     loop.follow(rest_to_rest(p + [0.5, 0.0, 0.0], p + [1.0, 0.0, 0.0], 0.0, 0.0, 1.0), AtEnd.CONTACT, id=2)
 
 
@@ -166,7 +166,7 @@ def test_a_perch_may_begin_in_the_brake_at_the_end_of_a_move():
 def test_an_abort_that_leaves_by_the_plans_own_recovery_is_a_recovery_and_is_not_undone(before, kept):
     own = 0.5 if before > 0.0 else 0.05
     loop, start = leaving(recovery_start=own)
-    loop.run(start + own - before - loop.controller.flown.now)
+    loop.run(start + own - before - loop.controller.flight_state.now)
     loop.controller.abort("stop it")
     with pytest.raises(TrajectoryRefused, match="about to be left"):
         loop.controller.follow(continuation(loop, start))
@@ -174,9 +174,9 @@ def test_an_abort_that_leaves_by_the_plans_own_recovery_is_a_recovery_and_is_not
         ready(loop, start, start + own + 0.05)
     loop.references.clear()
     loop.run(max(before, 0.0) + 0.02)
-    assert loop.controller.state is State.RECOVERING and loop.controller.flown.message == "recovering as planned: stop it"
+    assert loop.controller.state is State.RECOVERING and loop.controller.flight_state.message == "recovering as planned: stop it"
     loop.run(0.2)
-    assert loop.controller.state is State.RECOVERING and (loop.controller.flown.order.start > start) is kept
+    assert loop.controller.state is State.RECOVERING and (loop.controller.flight_state.order.start > start) is kept
     assert np.abs(np.diff(np.array(loop.references)[:, 0])).max() < 0.5 * 0.002 + 0.1 * kept, "the reference does not jump"
     loop.run(2.5)
     assert loop.controller.state is State.HOVERING
@@ -206,7 +206,7 @@ def test_a_recovery_beside_a_surface_knows_it_where_odometry_has_jumped(before):
     shifted(loop, (0.0, 0.4, 0.0))
     distances = []
     loop.run(0.1, until=lambda x: distances.append((x.plant.p - plan.contact) @ plan.normal))
-    assert isinstance(loop.controller.flown.source, Recovery), loop.events
+    assert isinstance(loop.controller.flight_state.source, Recovery), loop.events
     loop.run(3.0, until=lambda x: distances.append((x.plant.p - plan.contact) @ plan.normal))
     assert loop.controller.state is State.HOVERING and (before < 0.0 or min(distances) > 0.0), loop.events
     assert distances[-1] > 0.25, "away from the wall"
@@ -227,7 +227,7 @@ def test_a_recovery_that_begins_elsewhere_does_not_take_the_place_of_the_appende
     path = along_x(start + 0.8, 0.32 + 0.5, 0.4, 0.6, brakes=True)
     loop.controller.keep_ready(Order(7, SampledReference(path, loop.controller.vehicle.mass), start + 0.8))
     loop.run(0.9)
-    assert loop.controller.flown.order.source.duration > 1.0, "the plan's own one is flown"
+    assert loop.controller.flight_state.order.source.duration > 1.0, "the plan's own one is flown"
 
 
 def test_a_slow_landing_of_strong_rotors_ends_on_the_ground():

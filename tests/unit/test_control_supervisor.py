@@ -112,7 +112,7 @@ def test_motors_that_idle_without_an_order_are_stopped():
     loop.run(9.95)
     assert loop.controller.state is State.ARMED
     loop.run(0.1)
-    assert loop.controller.state is State.DISARMED and "no trajectory for 10 s" in loop.controller.flown.message
+    assert loop.controller.state is State.DISARMED and "no trajectory for 10 s" in loop.controller.flight_state.message
     loop.controller.command(Command.ARM)
     loop.follow(rest_to_rest(np.zeros(3), np.array([0, 0, 1.0]), 0, 0, 2.0))
     loop.run(0.9)
@@ -131,7 +131,7 @@ def test_arming_is_refused_on_the_side():
 def test_a_recovery_that_ends_at_the_ground_lands(height, end):
     loop = make_loop()
     loop.begin_in_hover((0.0, 0.0, height))
-    loop.controller.flown = recovered(loop.controller.flown._replace(ground=0.0), "for a test")
+    loop.controller.flight_state = recovered(loop.controller.flight_state._replace(ground=0.0), "for a test")
     loop.run(4.0)
     assert loop.controller.state is end, loop.events
 
@@ -143,7 +143,7 @@ def test_attached_stops_the_motors_and_arming_again_recovers():
     loop.run(plan.trajectory.duration + 0.04)
     loop.controller.command(Command.ATTACHED, "test")
     loop.run(0.05)
-    assert loop.controller.state is State.ATTACHED and np.all(np.array(loop.controller.flown.rotors.command) == 0)
+    assert loop.controller.state is State.ATTACHED and np.all(np.array(loop.controller.flight_state.rotors.command) == 0)
     loop.controller.command(Command.ARM)
     assert loop.controller.state is State.RECOVERING
     assert loop.run(4.0, until=lambda x: x.controller.state is State.HOVERING), loop.events
@@ -190,7 +190,7 @@ def test_replacing_a_trajectory_keeps_the_reference_continuous():
     p = loop.plant.p.copy()
     loop.follow(rest_to_rest(p, p + [2, 0, 0], 0, 0, 2.0), id=1)
     loop.run(1.0)
-    x = loop.controller.flown.setpoint(0.04)
+    x = loop.controller.flight_state.setpoint(0.04)
     # The new plan starts a little beside the running reference, as a re-plan on an estimate does.
     c = brake(np.array(x.p) + [0.05, 0.1, 0], x.v, x.a, x.h)._trajectory
     loop.references.clear()
@@ -199,7 +199,7 @@ def test_replacing_a_trajectory_keeps_the_reference_continuous():
     r = np.array(loop.references)
     velocity = np.diff(r, axis=0) / 0.002
     assert np.abs(np.diff(velocity, axis=0) / 0.002).max() < 12.0
-    assert loop.controller.flown.trajectory_id == 2
+    assert loop.controller.flight_state.trajectory_id == 2
 
 
 def test_blend_starts_on_the_old_and_ends_on_the_new_reference():
@@ -256,9 +256,9 @@ def test_each_fault_leads_to_its_answer(fault, expected, word, monkeypatch):
     elif fault == "rate":
         loop.plant.w = np.array([0.0, 0.0, 60.0])
     elif fault == "error":
-        flight.flown = following(flight.flown, Hold.at(p + [1.5, 0, 0], (0, 1, 0)))
+        flight.flight_state = following(flight.flight_state, Hold.at(p + [1.5, 0, 0], (0, 1, 0)))
     elif fault == "margin":
-        monkeypatch.setattr(monitors, "_MARGIN_LEAST", 0.45)
+        monkeypatch.setattr(monitors, "_MARGIN_MIN", 0.45)
         loop.plant.disturbances.mass_factor = 1.25
     elif fault == "heavy":
         loop.plant.disturbances.mass_factor = 1.7
@@ -268,9 +268,9 @@ def test_each_fault_leads_to_its_answer(fault, expected, word, monkeypatch):
         loop.controller.estimator(2, 3.2, "")
     elif fault == "diverged":
         loop.controller.estimator(3, 0.1, "covariance")
-    reached = loop.controller.state is expected and word in flight.flown.message
-    reached = reached or loop.run(3.0, until=lambda x: x.controller.state is expected and word in flight.flown.message)
-    assert reached, (loop.controller.state, flight.flown.message, loop.events)
+    reached = loop.controller.state is expected and word in flight.flight_state.message
+    reached = reached or loop.run(3.0, until=lambda x: x.controller.state is expected and word in flight.flight_state.message)
+    assert reached, (loop.controller.state, flight.flight_state.message, loop.events)
 
 
 @pytest.mark.parametrize("tilt", [70.0, 135.0, 180.0])
@@ -306,7 +306,7 @@ def along_x(start: float, p: float, v: float, duration: float, brakes: bool = Fa
 def leaving(recovery_start: float = 1.6):
     """A hovering vehicle that has just begun to track a plan with an appended recovery."""
     loop = hovering()
-    now, mass = loop.controller.flown.now, loop.controller.vehicle.mass
+    now, mass = loop.controller.flight_state.now, loop.controller.vehicle.mass
     plan = along_x(now, 0.0, 0.4, 2.5)
     loop.controller.follow(Order(7, SampledReference(plan, mass), now, AtEnd.RECOVER, 0.25, recovery_start))
     loop.run(0.1)
@@ -336,13 +336,13 @@ def test_an_abort_leaves_by_the_next_planned_recovery():
     message = loop.controller.abort("stop it")
     assert "stop it" in message and "planned recovery in 0.2" in message
     loop.run(0.15)
-    assert loop.controller.flown.order.start == start, "flown on until it begins"
+    assert loop.controller.flight_state.order.start == start, "flown on until it begins"
     loop.run(0.15)
-    assert loop.controller.flown.order.start == pytest.approx(start + 0.6)
+    assert loop.controller.flight_state.order.start == pytest.approx(start + 0.6)
     assert loop.controller.state is State.RECOVERING and "recovering as planned: stop it" in loop.controller.abort()
     loop.run(1.2)
     assert loop.controller.state is State.HOVERING
-    assert np.linalg.norm(loop.controller.flown.belief[3:6]) < 0.1
+    assert np.linalg.norm(loop.controller.flight_state.state_estimate[3:6]) < 0.1
 
 
 @pytest.mark.parametrize("others", [(), (("id", 6), 0.5), (("id", 7), 1.4)])
@@ -359,7 +359,7 @@ def test_near_the_wire_the_plans_own_recovery_is_the_way_out():
     loop, start = leaving(recovery_start=0.5)
     loop.run(0.1)
     loop.controller.command(Command.HOVER, "cancelled")
-    assert loop.controller.state is State.TRACKING and "planned recovery in 0.3" in loop.controller.flown.message
+    assert loop.controller.state is State.TRACKING and "planned recovery in 0.3" in loop.controller.flight_state.message
 
 
 def test_a_recovery_from_the_present_state_takes_the_place_of_the_appended_one():
@@ -367,9 +367,9 @@ def test_a_recovery_from_the_present_state_takes_the_place_of_the_appended_one()
     ready(loop, start, start + 0.2)
     ready(loop, start, start + 0.5)
     loop.run(0.35)
-    assert loop.controller.flown.order.start == start, "nobody aborts: the plan is flown to the wire"
+    assert loop.controller.flight_state.order.start == start, "nobody aborts: the plan is flown to the wire"
     loop.run(0.1)
-    assert loop.controller.flown.order.start == pytest.approx(start + 0.5)
+    assert loop.controller.flight_state.order.start == pytest.approx(start + 0.5)
     loop.run(1.5)
     assert loop.controller.state is State.HOVERING
 
@@ -378,4 +378,4 @@ def test_without_one_the_appended_recovery_is_flown():
     loop, start = leaving(recovery_start=0.5)
     ready(loop, start, start + 0.2)
     loop.run(0.6)
-    assert loop.controller.flown.order.start == start
+    assert loop.controller.flight_state.order.start == start

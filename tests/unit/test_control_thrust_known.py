@@ -24,14 +24,14 @@ def hovering(adaptive):
 
 def test_a_heavier_vehicle_is_known_before_the_perch_and_nothing_jumps():
     loop = hovering(True)
-    before, speed = loop.controller.compensator.disturbance[2], np.array(loop.controller.flown.rotors.command)
+    before, speed = loop.controller.compensator.disturbance[2], np.array(loop.controller.flight_state.rotors.command)
     assert before == pytest.approx(-0.2 * 9.81, abs=0.15)
     with pytest.raises(TrajectoryRefused, match="misses the contact"):  # of a plan for the file's mass
         loop.follow(perch("surface_90_1.7m").trajectory, AtEnd.CONTACT, id=2)
     assert abs(loop.controller.compensator.disturbance[2]) < 0.3, "what is left is no mass"
     # Seen from outside nothing has changed yet: the same thrust at the same rotor speeds.
     loop.run(0.002)
-    np.testing.assert_allclose(loop.controller.flown.rotors.command, speed, rtol=0.01)
+    np.testing.assert_allclose(loop.controller.flight_state.rotors.command, speed, rtol=0.01)
     assert loop.controller.vehicle.thrust_max == pytest.approx(load_vehicle("snapdragon").thrust_max / 1.2, rel=0.02)
 
 

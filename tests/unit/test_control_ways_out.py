@@ -39,7 +39,7 @@ def test_odometry_that_repeats_itself_ends_in_a_descent_that_brakes():
     begin, speed = loop.plant.p.copy(), loop.plant.v[0]
     repeat_last(loop)
     loop.run(1.2)
-    assert loop.controller.state is State.LANDING and loop.controller.flown.blind
+    assert loop.controller.state is State.LANDING and loop.controller.flight_state.blind
     assert abs(loop.plant.v[0]) < 0.3, "the speed of the last sample is braked"
     assert loop.plant.p[0] - begin[0] < 0.6 * 1.2 * speed, "much less than it would have coasted"
     assert loop.run(5.0, until=lambda x: x.controller.state is State.DISARMED), loop.events
@@ -61,9 +61,9 @@ def test_the_ground_pushes_upwards_and_a_wall_does_not(blow, ends):
 
 
 def test_a_velocity_that_cannot_be_is_not_braked():
-    thrust, *moment = descent((30.0, 0.0, 0.0)).wanted()
+    thrust, *moment = descent((30.0, 0.0, 0.0)).wrench()
     np.testing.assert_allclose(moment, 0.0, atol=1e-12)
-    assert descent((2.0, 0.0, 0.0)).wanted()[2] < 0.0, "moving along +x, the vehicle leans back"
+    assert descent((2.0, 0.0, 0.0)).wrench()[2] < 0.0, "moving along +x, the vehicle leans back"
 
 
 def test_lost_vio_does_not_brake_into_the_wall():

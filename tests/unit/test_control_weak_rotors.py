@@ -43,7 +43,7 @@ def test_the_ratio_is_known_within_150_ms(share):
         if k == 325:
             assert x.weak == (share < 0.77)
     assert x.ratio == pytest.approx(share, abs=0.03)
-    assert x.believed == pytest.approx(share if share < 0.77 else 1.0, abs=0.03)
+    assert x.applied_ratio == pytest.approx(share if share < 0.77 else 1.0, abs=0.03)
 
 
 def test_little_thrust_says_nothing():
@@ -138,7 +138,7 @@ def test_weak_rotors_hover_on_what_is_left():
     assert loop.controller.state is State.HOVERING and np.all(loop.rmse < 0.03)
     nominal = load_vehicle("snapdragon").thrust_max
     assert loop.controller.vehicle.thrust_max == pytest.approx(0.7 * nominal, rel=0.03)
-    assert loop.controller.flown.vehicle is loop.controller.vehicle is loop.controller.law.vehicle
+    assert loop.controller.flight_state.vehicle is loop.controller.vehicle is loop.controller.law.vehicle
 
 
 @pytest.mark.parametrize("before, state", [(0.45, State.LANDING), (0.2, State.TRACKING)])

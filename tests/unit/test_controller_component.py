@@ -17,8 +17,8 @@ from perch_control.parameters import ControllerChoice
 from perch_core.errors import ConfigError, PerchError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
-    NANOSECONDS, Ask, AtEnd, ChooseLaw, ControllerCommand, EstimatorHealth, MappedPowerline, PowerlineMap,
-    TrajectoryOrder, Transform)
+    NANOSECONDS, AtEnd, ControllerCommand, EstimatorHealth, MappedPowerline, PowerlineMap, SetControllerRequest, TrajectoryOrder, Transform,
+    TriggerRequest)
 from perch_core.vehicle import load_vehicle
 from unit.controller_flight import START, Flight, hovering, parameters
 
@@ -51,7 +51,7 @@ def test_status_and_reference_keep_their_periods_of_stamps(rate):
 
 def test_a_reference_that_nobody_wants_is_not_made():
     flight = Flight()
-    flight.component.reference.asked = lambda: False
+    flight.component.reference.receiver_check = lambda: False
     flight.take_off()
     assert not flight.references
 
@@ -59,11 +59,11 @@ def test_a_reference_that_nobody_wants_is_not_made():
 def test_it_does_not_arm_before_a_vehicle_takes_the_commands():
     flight = Flight()
     listening = False
-    flight.component.motor_command.asked = lambda: listening
+    flight.component.motor_command.receiver_check = lambda: listening
     flight.step(0.5)
     flight.order(Command.ARM)
     flight.step(0.1)
-    assert flight.state is State.DISARMED and "arm is refused: no vehicle takes the commands yet" in flight.said
+    assert flight.state is State.DISARMED and "arm is refused: no vehicle has subscribed to the commands yet" in flight.said
     assert not flight.motors[-1].armed
     listening = True
     flight.take_off()
@@ -152,7 +152,7 @@ def test_odometry_that_jumps_and_does_not_know_where_it_is_is_not_followed(varia
     flight = hovering()
     flight.step(0.1, p_WB=(1.0, 0.0, 0.6), pose_covariance=variance * np.eye(6))
     assert flight.state is state and "position jumped" in flight.said
-    assert (flight.component.flight.flown.belief[0] > 0.9) == (state is State.HOVERING)
+    assert (flight.component.flight.flight_state.state_estimate[0] > 0.9) == (state is State.HOVERING)
 
 
 def test_a_jump_with_a_covariance_that_is_no_number_is_refused():
@@ -218,7 +218,7 @@ def test_stamps_of_another_time_are_ignored_however_many_come_between(offset):
         for _ in range(3):
             flight.component.on_odometry(flight.odometry(stamp=flight.stamp + offset))
             flight.component.on_imu(flight.imu(stamp=flight.stamp + offset))
-    assert flight.state is State.HOVERING and "not of the present" in flight.said
+    assert flight.state is State.HOVERING and "not current" in flight.said
     assert max(m.stamp for m in flight.motors) < flight.stamp
     np.testing.assert_allclose(flight.plant.p, [0, 0, 0.6], atol=0.03)
 
@@ -252,7 +252,7 @@ def test_a_vehicle_that_was_started_again_is_answered_again():
     count, begun = len(flight.status), []
     flight.component.flight.law.begin = lambda: begun.append("what was remembered does not count")
     flight.step(0.5)
-    assert flight.motors[-1].stamp == flight.stamp - flight.period and "starting anew" in flight.said and begun
+    assert flight.motors[-1].stamp == flight.stamp - flight.period and "time has restarted" in flight.said and begun
     assert flight.status[-1].stamp < NANOSECONDS and len(flight.status) > count + 15
     flight.order(Command.ARM)
     flight.follow(flight.path((0, 0, 0), (0, 0, 0.5), 1.0))
@@ -346,7 +346,7 @@ def test_samples_are_flown_by_their_normalised_quaternions():
     flight.follow(samples(flight, q=q), at_end=AtEnd.HOLD)
     flight.step(0.1)
     assert flight.state is State.TRACKING
-    assert np.linalg.norm(flight.component.flight.flown.order.source.trajectory.q, axis=1) == pytest.approx(1.0, abs=1e-12)
+    assert np.linalg.norm(flight.component.flight.flight_state.order.source.trajectory.q, axis=1) == pytest.approx(1.0, abs=1e-12)
 
 
 def test_attached_before_any_odometry_is_refused():
@@ -390,7 +390,7 @@ def test_a_map_with_lines_that_are_none_is_ignored(end, what_becomes):
 def test_a_map_of_the_future_is_ignored_with_a_word_and_an_old_one_is_taken(ahead, said):
     flight = hovering()
     flight.component.on_powerlines(PowerlineMap(flight.stamp + ahead, (), False, ""))
-    assert ("to come" in flight.said) == said
+    assert ("in the future" in flight.said) == said
 
 
 # -- laws and parameters -----------------------------------------------------------------------------------------------
@@ -409,9 +409,9 @@ def test_laws_are_chosen_in_flight_when_they_are_built():
     flight.component.warm_up()
     flight.take_off()
     component = flight.component
-    answer = ask(component, "set_controller", ChooseLaw("pid", False))
+    answer = ask(component, "set_controller", SetControllerRequest("pid", False))
     assert (answer.success, answer.error_code) == (False, 1) and "geometric, nmpc" in answer.message
-    answer = ask(component, "set_controller", ChooseLaw("nmpc", False))
+    answer = ask(component, "set_controller", SetControllerRequest("nmpc", False))
     assert (answer.success, answer.error_code) == (False, 2) and "not ready" in answer.message
     job, = jobs
     built = job.function(*job.arguments)
@@ -421,7 +421,7 @@ def test_laws_are_chosen_in_flight_when_they_are_built():
     component.reconfigure(config)
     job.then(built)
     before = np.array(flight.motors[-1].rotor_speed)
-    assert ask(component, "set_controller", ChooseLaw("nmpc", True)).message == "nmpc+l1 flies"
+    assert ask(component, "set_controller", SetControllerRequest("nmpc", True)).message == "nmpc+l1 is active"
     flight.step(0.002)
     assert np.abs(np.array(flight.motors[-1].rotor_speed) - before).max() < 0.05 * before.max(), "no jump"
     assert built.settings.thrust == 2.5 and built.fallback.gains.position == (5.0, 5.0, 6.0)
@@ -437,7 +437,7 @@ def test_a_law_whose_settings_are_compiled_in_is_built_again_where_these_have_ch
     component.reconfigure(replace(component.config, nmpc=replace(component.config.nmpc, horizon=0.5)))
     first = jobs.pop()
     first.then(first.function(*first.arguments))
-    assert ask(component, "set_controller", ChooseLaw("nmpc", False)).error_code == 2
+    assert ask(component, "set_controller", SetControllerRequest("nmpc", False)).error_code == 2
     again = jobs.pop()
     assert again.arguments[2].nmpc.horizon == 0.5
 
@@ -450,7 +450,7 @@ def test_a_law_that_could_not_be_built_says_why():
     component.warm_up()
     jobs[0].then(PerchError("no compiler"))
     assert "no compiler" in lines[-1].text
-    assert "no compiler" in ask(component, "set_controller", ChooseLaw("nmpc", False)).message
+    assert "no compiler" in ask(component, "set_controller", SetControllerRequest("nmpc", False)).message
 
 
 def test_gains_change_in_flight_and_what_is_fixed_is_refused():
@@ -518,7 +518,7 @@ def test_abort_brakes_to_a_hover():
     flight = hovering()
     flight.follow(flight.path((0, 0, 0.6), (2, 0, 0.6), 2.0), id=6)
     flight.step(1.0)
-    answer = ask(flight.component, "abort", Ask())
+    answer = ask(flight.component, "abort", TriggerRequest())
     assert answer.success and "abort" in answer.message
     flight.step(1.5)
     assert flight.state is State.HOVERING and np.linalg.norm(flight.plant.v) < 0.05 and flight.plant.p[0] < 2.6
@@ -541,8 +541,8 @@ def test_the_law_of_the_guide_flies(tmp_path, monkeypatch):
     assert np.linalg.norm(flight.plant.p - reference) < 0.08  # it aims 20 ms ahead, at 1.8 m/s
     flight.step(1.5)
     np.testing.assert_allclose(flight.plant.p, [1.5, 1.0, 1.0], atol=0.02)
-    assert ask(flight.component, "set_controller", ChooseLaw("geometric", False)).success
+    assert ask(flight.component, "set_controller", SetControllerRequest("geometric", False)).success
     flight.step(0.3)
-    assert ask(flight.component, "set_controller", ChooseLaw("pd", True)).message == "pd+l1 flies"
+    assert ask(flight.component, "set_controller", SetControllerRequest("pd", True)).message == "pd+l1 is active"
     flight.step(0.5)
     assert flight.state is State.HOVERING and np.linalg.norm(flight.plant.v) < 0.05

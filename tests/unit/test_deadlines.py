@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from perch_core.ros.deadlines import MOVED, WINDOW, Deadlines, durations_us, median_and_p99
+from perch_core.ros.deadlines import LATE_IN_A_ROW_MAX, WINDOW, Deadlines, durations_us, median_and_p99
 from perch_sim.timing import CONTROL_PERIOD_NS as PERIOD
 
 START = 1_000_000_000  # stamp of the first step [ns]
@@ -12,7 +12,7 @@ AHEAD = 77_000_000_000  # of the monotonic clock, unknown to the node [ns]
 
 def answer(deadlines, steps, delay=lambda k: 0):
     for k in steps:
-        deadlines.answered(START + k * PERIOD, START + AHEAD + k * PERIOD + delay(k))
+        deadlines.record_answer(START + k * PERIOD, START + AHEAD + k * PERIOD + delay(k))
     return deadlines.report()
 
 
@@ -35,9 +35,9 @@ def test_steps_without_an_answer_are_missed():
 
 def test_a_vehicle_that_gives_up_time_is_on_time_again_soon():
     """Its stamps stay behind the wall clock for good; so many answers are missed, and a late one among those that follow."""
-    late = {2 * WINDOW + 10 * MOVED: 3 * PERIOD}
+    late = {2 * WINDOW + 10 * LATE_IN_A_ROW_MAX: 3 * PERIOD}
     report = answer(Deadlines(), range(10 * WINDOW), lambda k: (50 * PERIOD if k >= 2 * WINDOW else 0) + late.get(k, 0))
-    assert report["missed_deadlines"] == MOVED + 1
+    assert report["missed_deadlines"] == LATE_IN_A_ROW_MAX + 1
 
 
 def test_a_burst_that_is_caught_up_counts_all_its_late_answers():
@@ -70,7 +70,7 @@ def test_durations_are_reported_in_microseconds_and_none_without_any():
 def test_the_period_is_that_of_the_imu(period):
     deadlines = Deadlines()
     for k in range(1000):
-        deadlines.answered(k * period, k * period + (0 if k != 700 else period + 1))
+        deadlines.record_answer(k * period, k * period + (0 if k != 700 else period + 1))
     assert (deadlines.answers, deadlines.missed) == (1000, 1)
-    deadlines.answered(1003 * period, 1003 * period)  # three were never answered
+    deadlines.record_answer(1003 * period, 1003 * period)  # three were never answered
     assert (deadlines.answers, deadlines.missed) == (1004, 4)

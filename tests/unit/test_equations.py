@@ -65,7 +65,7 @@ def test_modules_and_registries_are_followed(tmp_path, flown):
     (LAW + '\n\ndef other():\n    """[defines M:eq2]"""\n', "2 definitions"),
     (LAW.replace("defines", "uses"), "0 definitions"),
     (LAW.replace("return gain()", "return 0"), "no program reaches"),
-    (LAW.replace("M:eq2]", "M:eq2, M:eq18]"), "spite"),
+    (LAW.replace("M:eq2]", "M:eq2, M:eq18]"), "although"),
     (LAW.replace("M:eq2]", "M:eq2, M:eq20]"), "no equation"),
 ])
 def test_two_definitions_none_and_one_that_does_not_fly_are_refused(tmp_path, law, word):

@@ -20,7 +20,7 @@ from perch_eval.campaign import command as campaign
 from perch_eval.campaign import workers
 from perch_eval.campaign.causes import cause_of
 from perch_eval.campaign.distributions import parse
-from perch_eval.campaign.engines import Task, carry_out
+from perch_eval.campaign.engines import Task, run_task
 from perch_eval.campaign.figures import Axis
 from perch_eval.campaign.results import Results, ResultsError, RunResult, read_results, worst
 from perch_eval.campaign.specification import Run, load_campaign
@@ -247,20 +247,20 @@ def test_the_interval_is_that_of_the_score_test(k, n):
 
 
 def test_a_rate_counts_outcomes():
-    assert Rate.of(k % 4 == 0 for k in range(10)) == Rate(3, 10) and Rate.of([]) == Rate(0, 0)
+    assert Rate.from_outcomes(k % 4 == 0 for k in range(10)) == Rate(3, 10) and Rate.from_outcomes([]) == Rate(0, 0)
 
 
 def test_spread_leaves_out_what_is_no_number():
-    spread = Spread.of([3.0, None, 1.0, float("nan"), 2.0])
+    spread = Spread.from_values([3.0, None, 1.0, float("nan"), 2.0])
     assert (spread.median, spread.low, spread.high, spread.count) == (2.0, 1.0, 3.0, 3)
-    assert Spread.of([]).words() == "-"
+    assert Spread.from_values([]).to_text() == "-"
 
 
 def test_a_run_leaves_the_other_cores_to_other_runs():
     before = cv2.getNumThreads()
     try:
         cv2.setNumThreads(2)
-        result = carry_out(Task(Run(0, 1, {}), {}, "no_such_engine", {}))
+        result = run_task(Task(Run(0, 1, {}), {}, "no_such_engine", {}))
         assert (result.outcome, cv2.getNumThreads()) == ("failed", 1)
     finally:
         cv2.setNumThreads(before)
@@ -282,7 +282,7 @@ def test_a_run_that_a_broken_pool_refuses_goes_on_waiting(monkeypatch, broken_at
             return super().submit(function, work, task)
 
     monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
-    monkeypatch.setattr(workers, "carry_out", lambda task: RunResult(task.run.number, task.run.seed, "perched", "perched", ""))
+    monkeypatch.setattr(workers, "run_task", lambda task: RunResult(task.run.number, task.run.seed, "perched", "perched", ""))
     tasks = [Task(Run(n, 0, {}), {}, "", "") for n in range(12)]
     assert {r.number for r in workers.in_pool(tasks, 2)} == set(range(12))
 

@@ -13,7 +13,7 @@ from unit.recorded_flights import flown, record
 from perch_core.vehicle import load_vehicle
 from perch_eval import comparison, plots
 from perch_eval.flight_view import FlightView
-from perch_eval.margins import in_words, limits, margins
+from perch_eval.margins import margin_text, limits, margins
 from perch_sim.scenario import load_scenario
 
 
@@ -40,7 +40,7 @@ def test_limits_are_words_also_after_json():
 @pytest.mark.parametrize("value, left, said", [
     (0.71234, 0.28766, "0.712 m/s (at most 1 m/s): +0.288 m/s left"), (1146.4, -1145.4, "1150 m/s (at most 1 m/s): -1150 m/s left")])
 def test_a_margin_in_words_has_units_and_three_digits(value, left, said):
-    assert in_words({"value": value, "low": None, "high": 1.0, "unit": "m/s", "left": left}) == said
+    assert margin_text({"value": value, "low": None, "high": 1.0, "unit": "m/s", "left": left}) == said
 
 
 def compared(page):
@@ -67,7 +67,7 @@ def test_two_flights_are_on_one_page(reported, tmp_path):
 
 
 def test_each_flight_has_its_pad_and_its_wires_where_they_differ(recorded):
-    view = FlightView.of(recorded[1], load_vehicle("snapdragon"), "one", "#111111")
+    view = FlightView.from_flight(recorded[1], load_vehicle("snapdragon"), "one", "#111111")
     wire = np.array([[[1.0, -1.0, 2.0], [1.0, 1.0, 2.0]]])
     one = replace(view, cables=wire)
     other = replace(one, name="other", colour="#222222", pad=(view.pad[0] + [0.5, 0.0, 0.2], view.pad[1]), cables=wire + 0.3)

@@ -113,6 +113,6 @@ def test_a_comparison_with_a_flight_that_was_not_begun_is_written(tmp_path, monk
         flown[-1] |= {"rmse": [None] * 3, "outcome": "not begun: refused"}
         return flown
 
-    monkeypatch.setattr(control, "computed", known)
+    monkeypatch.setattr(control, "cached_figures", known)
     sections = control.comparison_sections(Effort(True, 1, tmp_path, tmp_path, "test", False, range(1, 2), range(1, 2), 1))
     assert len(sections) == 1 and "not begun: refused" in (tmp_path / "comparison.md").read_text()

@@ -69,5 +69,5 @@ def test_stacks_that_start_in_the_same_second_have_logs_of_their_own(monkeypatch
     folders = []
     for process in (1, 2):
         monkeypatch.setattr(start_stack.os, "getpid", lambda: process)  # noqa: B023 (called in this turn)
-        folders.append(start_stack.own_folder())
+        folders.append(start_stack.default_log_folder())
     assert folders[0] != folders[1]

@@ -163,54 +163,54 @@ def hear_who_owes(pilot):
 
 
 def test_who_is_waited_for_is_told_when_time_stands_still(mission, pilot, monkeypatch):
-    monkeypatch.setattr(client_module, "NAMED", 0.5)
+    monkeypatch.setattr(client_module, "EXPLAIN_AFTER", 0.5)
     told, on_phase = finish_when(mission, "waiting")
     mission.passes.set()
     hear_who_owes(pilot)
     threading.Thread(target=lambda: (mission.begins.wait(120.0), mission.passes.clear()), daemon=True).start()
     assert pilot.fly(SCENARIO, on_phase).outcome == "perched"
     waiting = {message for phase, message in told if phase == "waiting"}
-    assert waiting == {"simulation time stands still: waiting for estimator: odometry of 1.200 s"}
+    assert waiting == {"simulation time has stopped: waiting for estimator: odometry of 1.200 s"}
 
 
 def test_a_node_that_hangs_before_it_was_ever_heard_is_named(mission, pilot, monkeypatch):
-    monkeypatch.setattr(client_module, "SILENT", 0.5)
+    monkeypatch.setattr(client_module, "SILENCE_TIMEOUT", 0.5)
     told = []
 
     def on_phase(t, phase, message):
         told.append(message)
-        if "silent" in message:
+        if "no diagnostics" in message:
             mission.finish.set()
 
     mission.passes.set()
     assert pilot.fly(SCENARIO, on_phase).outcome == "perched"
-    assert [message for message in told if "silent" in message] == ["/mission has been silent for 0.5 s"]  # others are not there, or speak
+    assert [message for message in told if "no diagnostics" in message] == ["/mission has sent no diagnostics for 0.5 s"]  # others are not there, or speak
 
 
 def test_a_node_of_a_process_in_which_others_speak_is_not_called_silent(mission, pilot, monkeypatch):
-    monkeypatch.setattr(client_module, "SILENT", 0.5)
+    monkeypatch.setattr(client_module, "SILENCE_TIMEOUT", 0.5)
     others = [DiagnosticStatus(name="/estimator", hardware_id=""), DiagnosticStatus(name="/vio", hardware_id="another")]
     pilot.spin_until(lambda: mission.diagnostics.publish(DiagnosticArray(status=others)) or "/vio" in pilot.processes, 60.0)
-    news, end = [], time.monotonic() + 60.0
-    while not news and time.monotonic() < end:
+    events, end = [], time.monotonic() + 60.0
+    while not events and time.monotonic() < end:
         pilot.spin(0.1)
-        news = pilot.news()
-    assert news == ["/vio has been silent for 0.5 s"]
+        events = pilot.node_events()
+    assert events == ["/vio has sent no diagnostics for 0.5 s"]
 
 
 def test_time_that_stands_still_for_long_ends_the_flight_and_names_who_owes(mission, pilot, monkeypatch):
     mission.passes.set()
     hear_who_owes(pilot)
     threading.Thread(target=lambda: (mission.begins.wait(120.0), mission.passes.clear()), daemon=True).start()
-    look = client_module._Progress.look
+    update = client_module._Progress.update
 
     def hurried(progress, time_now):
-        progress._moved -= 0.0 if mission.passes.is_set() else 100.0  # every look is later than the one before
-        return look(progress, time_now)
+        progress._last_progress -= 0.0 if mission.passes.is_set() else 100.0  # every update is later than the one before
+        return update(progress, time_now)
 
-    monkeypatch.setattr(client_module._Progress, "look", hurried)
-    with pytest.raises(PerchError, match=r"stood still at .* waiting for estimator: odometry of 1.200 s"):
-        pilot.fly(SCENARIO, stall=1000.0)
+    monkeypatch.setattr(client_module._Progress, "update", hurried)
+    with pytest.raises(PerchError, match=r"stopped at .* waiting for estimator: odometry of 1.200 s"):
+        pilot.fly(SCENARIO, stall_timeout=1000.0)
 
 
 def test_a_flight_past_its_time_limit_is_cancelled(mission, pilot):
@@ -220,7 +220,7 @@ def test_a_flight_past_its_time_limit_is_cancelled(mission, pilot):
 
 
 def test_a_mission_that_does_not_end_a_cancelled_goal_ends_the_wait(mission, pilot, monkeypatch):
-    monkeypatch.setattr(client_module, "CANCEL_PATIENCE", 1.0)
+    monkeypatch.setattr(client_module, "CANCEL_TIMEOUT", 1.0)
     mission.obeys = False
     mission.passes.set()
     with pytest.raises(PerchError, match="has not ended the goal in 1 s since it was cancelled"):
@@ -233,8 +233,8 @@ def test_a_mission_that_is_restarted_before_it_answers_has_lost_the_goal(mission
     found = iter([{b"first"}])
     monkeypatch.setattr(pilot, "_servers", lambda: next(found, {b"second"}))
     monkeypatch.setattr(pilot._client, "send_goal_async", lambda *_, **__: rclpy.task.Future())
-    with pytest.raises(PerchError, match="the mission was restarted: the goal is lost"):
-        pilot.fly(SCENARIO, stall=1000.0)
+    with pytest.raises(PerchError, match="the mission was restarted: its goal was dropped"):
+        pilot.fly(SCENARIO, stall_timeout=1000.0)
 
 
 def test_ctrl_c_ends_the_wait(mission, pilot):

@@ -133,7 +133,7 @@ def test_an_animation_has_a_frame_for_each_moment_and_plots_are_written(recorded
 
 def test_a_stroboscopic_picture_shows_each_instant_of_the_perch(recorded, tmp_path):
     path, _ = recorded
-    view = FlightView.of(RecordedFlight(path), load_vehicle("snapdragon"))
+    view = FlightView.from_flight(RecordedFlight(path), load_vehicle("snapdragon"))
     figure = stroboscope(view, 1.5, 3.4, 7)
     discs = [c for c in figure.axes[0].collections if c.get_zorder() > 3.0]
     assert len(discs) == 7 * 4

@@ -7,7 +7,7 @@ from perch_eval import consistency
 from perch_eval.estimation_flight import EstimatorTrack, Flight, motion_of
 from perch_eval.in_process.modelled_sight import ModelledSight
 from perch_eval.perch_motion import ImuReadings
-from perch_eval.target_sightings import estimated_body, see_target
+from perch_eval.target_sightings import estimated_body, localize_target
 from perch_perception.target_localizer import TargetLocalizerConfig
 from perch_sim.scenario import load_scenario
 from perch_sim.state_history import StateHistory, TrueState
@@ -39,8 +39,8 @@ def test_the_estimated_body_is_the_truth_less_the_error(hover):
 @pytest.mark.slow
 def test_errors_of_the_body_move_vehicle_and_target_alike(hover):
     scenario, flight = hover
-    exact = see_target(scenario, flight, track_of(flight), 3, 3.5, 3.8)
-    wrong = see_target(scenario, flight, track_of(flight, np.r_[OFF, np.zeros(12)], sigma=0.015), 3, 3.5, 3.8)
+    exact = localize_target(scenario, flight, track_of(flight), 3, 3.5, 3.8)
+    wrong = localize_target(scenario, flight, track_of(flight, np.r_[OFF, np.zeros(12)], sigma=0.015), 3, 3.5, 3.8)
     assert np.isfinite(exact.errors).all() and len(exact.times) == 9
     assert np.linalg.norm(exact.errors[:, :3], axis=1).max() < 0.01
     np.testing.assert_allclose(wrong.errors[:, :3], exact.errors[:, :3], atol=2e-3)

@@ -28,7 +28,7 @@ def test_controllers_that_track_well_until_they_crash_fail(effort, monkeypatch, 
         return [{"controller": c, "condition": k, "maneuver": m, "seed": seed, "rmse": (0.01,) * 3 if "L1" in c else (0.04,) * 3,
                  "outcome": {"line": "held", "perch": "perched"}[m] if outcome == "good" else outcome} for c, k, m, seed in jobs]
 
-    monkeypatch.setattr(control, "computed", rows)
+    monkeypatch.setattr(control, "cached_figures", rows)
     assert set(verdicts(control.comparison_sections(effort)[0]).values()) == {verdict}
 
 
@@ -39,7 +39,7 @@ def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch)
                      "distance": 1.0, "settled": 0.1} for s, n, t in jobs]
         return [{"name": name, "seed": seed, "refused": "" if seed == 1 else "thrust", "instants": [(1.0, "")] if seed == 1 else []} for name, seed in jobs]
 
-    monkeypatch.setattr(ways_out, "computed", rows)
+    monkeypatch.setattr(ways_out, "cached_figures", rows)
     assert set(verdicts(ways_out.sections(effort)[0]).values()) == {"fails"}
 
 

@@ -20,7 +20,7 @@ from perch_core.vehicle import load_vehicle
 from perch_eval.ros.definitions import message_definition
 from perch_eval.view.gate import allowed
 from perch_eval.view.scene import Path, map_markers, vehicle_markers, world_markers
-from perch_eval.ros.viewer import CAMERAS, FAST, LOCAL, MARKERS, PASSING, RARE, Viewer, ViewerParameters
+from perch_eval.ros.viewer import CAMERAS, FAST, LOCAL, MARKERS, RARE, UNLATCHED, Viewer, ViewerParameters
 from perch_msgs.msg import Trajectory
 from perch_sim.scenario import load_scenario
 from rclpy.serialization import deserialize_message, serialize_message
@@ -257,7 +257,7 @@ def test_origins_are_a_parameter():
 
 
 def test_the_server_behind_the_gate_listens_on_the_loopback_alone(served):
-    host, port = served.viewer.server._gate._behind
+    host, port = served.viewer.server._gate._backend
     assert host.startswith("127.") and host != "127.0.0.1" and port != served.viewer.server.port
 
 
@@ -276,7 +276,7 @@ def test_no_handshake_ends_a_connection_and_nothing_else(served):
 
 def test_the_layout_shows_what_is_served():
     text = (config.config_dir() / "foxglove_layout.json").read_text()
-    channels = (*FAST, *RARE, *PASSING, MARKERS, *(f"camera_{c}/image_raw/compressed" for c in CAMERAS))
+    channels = (*FAST, *RARE, *UNLATCHED, MARKERS, *(f"camera_{c}/image_raw/compressed" for c in CAMERAS))
     types = {f"/{channel.lstrip('/')}": topics.message_type(channel) for channel in channels}
     paths = re.findall(r'"(/[a-z_]+[^"]*)"', text)
     assert len(paths) > 15

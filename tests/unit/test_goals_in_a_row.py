@@ -11,7 +11,7 @@ import pytest
 
 from perch_control.maneuvers import recovered
 from perch_control.modes import State
-from perch_core.values import Ask, ImuSample
+from perch_core.values import ImuSample, TriggerRequest
 from perch_eval.goal import goal_of
 from perch_eval.in_process import arrange
 from perch_sim.contact_event import ContactState
@@ -63,7 +63,7 @@ def test_perch_depart_and_perch_again(name):
             sent, begun = loop.send("mission", goal), loop.time
             while not plant.hold.active and loop.time < begun + 40.0:
                 loop.step()
-            flight.flown = recovered(flight.flown, "test")
+            flight.flight_state = recovered(flight.flight_state, "test")
             while sent.result is None and loop.time < begun + 60.0:
                 loop.step()
             result = sent.result
@@ -72,7 +72,7 @@ def test_perch_depart_and_perch_again(name):
         if not given_up:
             refused = ended(loop, goal)
             assert (refused.success, refused.error_code) == (False, 9) and "depart" in refused.message
-        begun, answers = loop.time, loop.request("mission", "depart", Ask())
+        begun, answers = loop.time, loop.request("mission", "depart", TriggerRequest())
         while not answers and loop.time < begun + 10.0:
             loop.step()
         assert answers[0].success and not plant.hold.active and not plant.crashed, answers
@@ -84,7 +84,7 @@ def test_perch_depart_and_perch_again(name):
 
 def test_a_departure_from_where_nothing_is_perched_on_is_refused():
     loop = arrange(load_scenario("surface_90"), 1)
-    answers = loop.request("mission", "depart", Ask())
+    answers = loop.request("mission", "depart", TriggerRequest())
     while loop.time < 1.2:
         loop.step()
     loop.close()

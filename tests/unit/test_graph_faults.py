@@ -17,8 +17,8 @@ import pytest
 from perch_core.errors import PerchError
 from perch_eval.graph_faults import campaign
 from perch_eval.graph_faults.cases import (
-    FAULTS, LOCKSTEP, MODES, NODES, PHASES, PROCESS, REAL_TIME, SAFE, WORDS, Case, Situation, cases, ending, named)
-from perch_eval.graph_faults.flight import UNANSWERED, _Director
+    FAULTS, LOCKSTEP, MODES, NODE_PATTERNS, NODES, PHASES, PROCESS, REAL_TIME, SAFE, Case, Situation, cases, ending, first_report)
+from perch_eval.graph_faults.flight import UNANSWERED, _FaultInjector
 from perch_eval.graph_faults.relay_node import DELAY, Disturbance
 from perch_eval.fork_server import alive, session, start
 
@@ -31,7 +31,7 @@ def test_every_node_is_struck_by_every_fault_in_every_phase_and_mode():
     process = [case for case in found if case.fault in PROCESS]
     assert {case[:4] for case in process} == {(f, n, p, m) for f in PROCESS for n in NODES for p in PHASES for m in MODES}
     assert all(case.mode == REAL_TIME for case in found if case.fault not in PROCESS)
-    assert {case.fault for case in found} == set(FAULTS) and {case.node for case in found} <= set(WORDS)
+    assert {case.fault for case in found} == set(FAULTS) and {case.node for case in found} <= set(NODE_PATTERNS)
     assert max(Counter(case.fault for case in found[:40]).values()) < 20  # the first ones are a sample of all
 
 
@@ -54,25 +54,25 @@ def test_a_node_is_no_witness_of_itself_and_routine_names_nobody():
     lines = ["[ERROR] [1000000101.0] [estimator]: odometry lost", "[INFO] [1000000101.0] [mission]: odometry is good",
              "[INFO] [1000000102.5] [controller]: descent without position: no odometry",
              "[ERROR] [1000000090.0] [vehicle]: lockstep: estimator is gone", "Traceback: estimator"]
-    assert named(CASE, 1000000100.0, lines, []) == (2.5, "controller: descent without position: no odometry")
-    assert named(CASE, 1000000100.0, lines[:2], [(1000000101.0, "waits for the estimator")]) is None
-    assert named(CASE, 1000000100.0, lines, [(1000000101.5, "/estimator has been silent for 3 s")])[0] == 1.5
+    assert first_report(CASE, 1000000100.0, lines, []) == (2.5, "controller: descent without position: no odometry")
+    assert first_report(CASE, 1000000100.0, lines[:2], [(1000000101.0, "waits for the estimator")]) is None
+    assert first_report(CASE, 1000000100.0, lines, [(1000000101.5, "/estimator has sent no diagnostics for 3 s")])[0] == 1.5
 
 
 @pytest.mark.parametrize("node, words, counts", [
     ("vehicle", "the simulation has stopped at its maximum", False), ("vehicle", "no IMU for 0.2 s", True),
     ("vehicle", "imu/data_raw: not used", True), ("mission", "no adhesion: hovering at the end of trajectory 3", False),
-    ("mission", "the mission was restarted: the goal is lost", True), ("target_localizer", "looking for the target (no tags seen)", False),
+    ("mission", "the mission was restarted: its goal was dropped", True), ("target_localizer", "looking for the target (no tags detected)", False),
     ("vio_model", "previous plan refused: no time", False), ("vio_model", "/vio_model was restarted", True)])
 def test_other_words_name_nobody(node, words, counts):
-    assert (named(CASE._replace(node=node), 100.0, [], [(101.0, words)]) is not None) is counts
+    assert (first_report(CASE._replace(node=node), 100.0, [], [(101.0, words)]) is not None) is counts
 
 
 def test_disturbances():
     def passed(fault: str) -> list[int]:
         one = Disturbance()
         one.fault = fault
-        found = [m for k in range(100) for m in one.passed(k, 0.0)]
+        found = [m for k in range(100) for m in one.forward(k, 0.0)]
         return found + one.due(DELAY - 0.01) + [-1] + one.due(DELAY + 0.01)
 
     assert passed("") == [*range(100), -1]
@@ -142,10 +142,10 @@ def test_a_goal_whose_mission_is_gone_is_followed_until_the_fault_has_had_its_ti
     monkeypatch.setattr("perch_eval.graph_faults.flight.time", SimpleNamespace(time=lambda: 1000.0))
     for case, after, followed in ((CASE._replace(node="mission"), 5.0, True), (CASE._replace(node="mission"), 6.0, False),
                                   (CASE._replace(node="mission", fault="restart"), 60.0, True), (CASE, 60.0, True)):
-        director = _Director(case, None, None, 1.2, None)
-        director.struck = 1000.0 - after
+        injector = _FaultInjector(case, None, None, 1.2, None)
+        injector.injection_wall_time = 1000.0 - after
         with nullcontext() if followed else pytest.raises(PerchError, match=UNANSWERED):
-            director.follow()
+            injector.check_goal()
 
 
 def test_processes_of_a_fork_server_are_their_own(tmp_path, monkeypatch):

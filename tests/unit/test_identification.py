@@ -9,8 +9,8 @@ from perch_core.errors import PerchError
 from perch_core.values import ImuSample, RatesThrust
 from perch_core.vehicle import Battery, load_vehicle
 from perch_eval.flight import Flight
-from perch_eval.identification import answers, command
-from perch_eval.identification.fit import Found, battery, identify, rates, thrust
+from perch_eval.identification import command, responses
+from perch_eval.identification.fit import Estimate, battery, identify, rates, thrust
 from perch_eval.identification.record import Record, record_of
 from scipy.signal import lfilter, lfiltic
 
@@ -63,7 +63,7 @@ def test_what_a_record_was_made_with_is_found(found):
         one = found[key]
         assert abs(one.value - value) < max(4.0 * one.sigma, 0.01 * value), str(one)
         if not key.startswith("drag"):
-            assert not one.refused and one.sigma < 0.1 * value, str(one)
+            assert not one.reason and one.sigma < 0.1 * value, str(one)
 
 
 def test_what_the_delay_leaves_open_is_open_for_the_lags():
@@ -83,8 +83,8 @@ def test_lags_are_not_told_without_the_delay():
     still = replace(one, rates=one.rates * (0.0, 0.0, 1.0), gyro=one.gyro * (0.0, 0.0, 1.0))
     found = {each.key: each for each in identify(still, VEHICLE)[0]}
     for key in ("actuation.rate_lag[2]", "actuation.thrust_lag"):
-        assert found[key].refused == "it depends on the delay, which is not identified"
-    assert not found["actuation.rate_gain[2]"].refused
+        assert found[key].reason == "it depends on the delay, which is not identified"
+    assert not found["actuation.rate_gain[2]"].reason
 
 
 def test_parts_of_a_record_do_not_begin_settled():
@@ -96,15 +96,15 @@ def test_parts_of_a_record_do_not_begin_settled():
 
 def test_a_hover_tells_nothing_and_says_so():
     found, _ = identify(record(size=0.05, seconds=10.0), VEHICLE)
-    assert all(one.refused for one in found if one.key.startswith("actuation"))
-    assert "too small" in found[0].refused
-    assert "neither roll nor pitch" in next(one.refused for one in found if one.key == "actuation.delay")
+    assert all(one.reason for one in found if one.key.startswith("actuation"))
+    assert "too small" in found[0].reason
+    assert "not identifiable from roll or pitch" in next(one.reason for one in found if one.key == "actuation.delay")
 
 
 @pytest.mark.slow
 def test_a_loop_that_rings_is_none_of_first_order():
     found, answers = identify(record(oscillation=15.0, seconds=10.0), VEHICLE)
-    assert "explains" in found[0].refused and answers[0].explained < 0.9
+    assert "explains" in found[0].reason and answers[0].explained < 0.9
 
 
 @pytest.mark.slow
@@ -158,13 +158,13 @@ def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_the_report_shows_the_loop_where_rates_are_taken(monkeypatch):
-    monkeypatch.setattr(answers, "perch_window", lambda flight: (1.0, 2.0))
+    monkeypatch.setattr(responses, "perch_window", lambda flight: (1.0, 2.0))
     one = record(seconds=3.0)
     sent = [(float(t), RatesThrust(0, True, tuple(map(float, w)), float(T))) for t, w, T in zip(one.command_t, one.rates, one.thrust)]
     imu = [(float(t), ImuSample(0, tuple(map(float, w)), tuple(map(float, f)))) for t, w, f in zip(one.t, one.gyro, one.accel)]
-    drawn = answers.inner_loop_figure(Flight({"rates_thrust_command": sent, "imu/data_raw": imu}), VEHICLE)
+    drawn = responses.inner_loop_figure(Flight({"rates_thrust_command": sent, "imu/data_raw": imu}), VEHICLE)
     assert drawn is not None and len(drawn.axes) == 8 and all(axes.lines for axes in drawn.axes)
-    assert answers.inner_loop_figure(Flight({"imu/data_raw": imu}), VEHICLE) is None
+    assert responses.inner_loop_figure(Flight({"imu/data_raw": imu}), VEHICLE) is None
 
 
 # -- the battery: one flight at each voltage -------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ VOLTAGES = (16.4, 15.6, 14.8, 14.0)
 
 
 def gains(*factors, sigma=0.004, refused=""):
-    return [Found("actuation.thrust_gain", factor, sigma, "", refused) for factor in factors]
+    return [Estimate("actuation.thrust_gain", factor, sigma, "", refused) for factor in factors]
 
 
 @pytest.mark.parametrize("flown", [0.0, 1.5])
@@ -181,7 +181,7 @@ def test_the_exponent_of_the_battery_is_found(flown):
     noise = 1.0 + 0.004 * np.random.default_rng(1).standard_normal(4)
     told = gains(*(0.97 * noise * (np.array(VOLTAGES) / 16.4) ** (1.7 - flown)))
     one = battery(VOLTAGES, told, flown)
-    assert not one.refused and abs(one.value - 1.7) < 3.0 * one.sigma and one.sigma < 0.1
+    assert not one.reason and abs(one.value - 1.7) < 3.0 * one.sigma and one.sigma < 0.1
 
 
 @pytest.mark.parametrize("voltages, factors, sigma, words", [
@@ -189,7 +189,7 @@ def test_the_exponent_of_the_battery_is_found(flown):
     ((16.4, 16.4), (1.0, 1.0), 0.004, "apart"), (VOLTAGES, (1.0, 0.99, 1.02, 0.995), 0.004, "exponent of"),
     (VOLTAGES, (1.0, 0.9, 0.81, 0.73), 0.2, "standard deviation")])
 def test_a_battery_curve_that_does_not_fit_is_refused(voltages, factors, sigma, words):
-    assert words in battery(voltages, gains(*factors, sigma=sigma)).refused
+    assert words in battery(voltages, gains(*factors, sigma=sigma)).reason
 
 
 def test_a_battery_curve_that_does_not_fit_is_one_line_and_writes_nothing(tmp_path, monkeypatch, capsys):
@@ -205,17 +205,17 @@ def test_a_battery_curve_that_does_not_fit_is_one_line_and_writes_nothing(tmp_pa
 
 
 def test_a_gain_that_is_not_told_leaves_the_battery_untold():
-    assert battery(VOLTAGES, gains(1.0, 0.9, 0.81, 0.73, refused="too small")).refused == "too small"
+    assert battery(VOLTAGES, gains(1.0, 0.9, 0.81, 0.73, refused="too small")).reason == "too small"
 
 
 def test_the_battery_is_written_where_the_vehicle_file_has_it(tmp_path):
-    found = [Found("actuation.thrust_gain", 0.98, 0.01, ""), battery(VOLTAGES, gains(*((np.array(VOLTAGES) / 16.4) ** 1.7)))]
-    (tmp_path / "one.yaml").write_text(command.entries(found, VEHICLE, "snapdragon_rates", "one", "a test", VOLTAGES))
+    found = [Estimate("actuation.thrust_gain", 0.98, 0.01, ""), battery(VOLTAGES, gains(*((np.array(VOLTAGES) / 16.4) ** 1.7)))]
+    (tmp_path / "one.yaml").write_text(command.vehicle_file_text(found, VEHICLE, "snapdragon_rates", "one", "a test", VOLTAGES))
     assert load_vehicle(tmp_path / "one.yaml").actuation.battery == Battery(reference=16.4, exponent=1.7, range=(14.0, 16.4))
 
 
 @pytest.mark.parametrize("arguments, words", [
-    (["--voltage", "16"], "two and more"), (["--voltage", "16", "-3"], "two and more"), (["--voltage", "16", "14"], "has none"),
+    (["--voltage", "16"], "two or more"), (["--voltage", "16", "-3"], "two or more"), (["--voltage", "16", "14"], "has none"),
     (["--voltage", "16", "14", "--recording", "/no/file"], "1 files, and 2 voltages")])
 def test_voltages_that_are_none_are_one_line(arguments, words, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["identify.py", "--vehicle", "snapdragon_rates", *arguments])

@@ -8,7 +8,7 @@ from closed_loop.plant import Plant
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from perch_control.controller import Controller
-from perch_control.inner_loop import InnerLoopEstimate, stopped
+from perch_control.inner_loop import InnerLoopEstimate, rotors_at_rest
 from perch_control.parameters import ControllerParameters
 from perch_control.rotor_lag import RotorEstimate
 from perch_core.errors import ConfigError
@@ -46,7 +46,7 @@ def test_a_loop_is_asked_for_what_the_rotors_would_do(delay, gain):
     actuation = Actuation(type="rates_and_thrust", delay=delay, rate_lag=(0.03, 0.025, 0.06), rate_gain=(gain,) * 3, thrust_lag=0.04,
                           thrust_gain=1 / gain)
     vehicle, h = replace(VEHICLE, actuation=actuation), 0.002
-    plant, estimate = Plant(vehicle, p=np.array([0.0, 0.0, 5.0])), stopped(vehicle).turning(HOVER)
+    plant, estimate = Plant(vehicle, p=np.array([0.0, 0.0, 5.0])), rotors_at_rest(vehicle).turning(HOVER)
     w, T, late = np.zeros(3), vehicle.hover_thrust, round(delay / h)
     queue, rotors, loop = [(np.zeros(3), T)] * late, [], []
     for k in range(200):
@@ -68,7 +68,7 @@ def test_a_loop_is_asked_for_what_the_rotors_would_do(delay, gain):
 
 
 def test_commands_keep_to_the_loops_limits():
-    estimate = stopped(VEHICLE).turning(HOVER).following((VEHICLE.speed_max, VEHICLE.speed_min) * 2, (0.0,) * 9 + (1.0, 40.0, -40.0, 0.0),
+    estimate = rotors_at_rest(VEHICLE).turning(HOVER).following((VEHICLE.speed_max, VEHICLE.speed_min) * 2, (0.0,) * 9 + (1.0, 40.0, -40.0, 0.0),
                                                          VEHICLE)
     assert np.abs(estimate.sent.w_B).max() <= VEHICLE.actuation.rate_max
     assert 0.0 <= estimate.sent.thrust <= 4 * VEHICLE.thrust_max / VEHICLE.mass
@@ -81,15 +81,15 @@ def test_an_attitude_is_that_at_which_its_loop_asks_for_the_rates(x):
     q = Rotation.from_rotvec(3.0 * np.array(x[:3])).as_quat()
     speeds = tuple(HOVER + 60.0 * np.array(x[3:7]))
     state, w_C = (0.0,) * 6 + (*q, *x[7:10]), tuple(2.0 * np.array(x[4:7]))
-    rates = stopped(VEHICLE).turning(HOVER).following(speeds, state, VEHICLE).sent
-    sent = stopped(vehicle).turning(HOVER).following(speeds, state, vehicle, w_C).sent
+    rates = rotors_at_rest(VEHICLE).turning(HOVER).following(speeds, state, VEHICLE).sent
+    sent = rotors_at_rest(vehicle).turning(HOVER).following(speeds, state, vehicle, w_C).sent
     assert sent.w_B == w_C and sent.thrust == rates.thrust
     np.testing.assert_allclose(rates_of_attitude(q, np.array(sent.q_WB), np.array(w_C), vehicle.actuation.attitude_lag), rates.w_B,
                                atol=1e-9)
 
 
 def test_rotors_without_a_loop_are_what_they_were():
-    assert isinstance(stopped(load_vehicle("snapdragon")), RotorEstimate) and isinstance(stopped(VEHICLE), InnerLoopEstimate)
+    assert isinstance(rotors_at_rest(load_vehicle("snapdragon")), RotorEstimate) and isinstance(rotors_at_rest(VEHICLE), InnerLoopEstimate)
 
 
 @pytest.mark.parametrize("attitude", [False, True])

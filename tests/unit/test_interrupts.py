@@ -19,24 +19,24 @@ SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
 
 @pytest.fixture
-def visit(monkeypatch, ros_domain):
-    """`ros_graph.connection.visit`, of the scripts."""
+def connect(monkeypatch, ros_domain):
+    """`ros_graph.connection.connect`, of the scripts."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    from ros_graph.connection import visit
+    from ros_graph.connection import connect
 
-    return visit
+    return connect
 
 
-def test_ctrl_c_ends_the_wait_for_nodes(visit, tmp_path):
+def test_ctrl_c_ends_the_wait_for_nodes(connect, tmp_path):
     loading = Program("loading", (sys.executable, "-S", "-c", "import time; time.sleep(1000)"), ("/loading",))
-    with Stack([loading], tmp_path) as stack, pytest.raises(KeyboardInterrupt), visit() as graph:
+    with Stack([loading], tmp_path) as stack, pytest.raises(KeyboardInterrupt), connect() as graph:
         signal.raise_signal(signal.SIGINT)
         stack.wait_until_ready(graph.visible_nodes, timeout=60.0)
     assert stack.pids == {}
 
 
-def test_ctrl_c_that_nobody_looked_for_counts_at_the_end_of_the_visit(visit):
-    with pytest.raises(KeyboardInterrupt), visit():
+def test_ctrl_c_that_nobody_looked_for_counts_at_the_end_of_the_connection(connect):
+    with pytest.raises(KeyboardInterrupt), connect():
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -107,7 +107,7 @@ def test_a_signal_at_the_start_is_kept_without_a_traceback(monkeypatch, capfd, n
             Handle()
         gc.collect()
         assert capfd.readouterr().err == ""
-        stop.patient = True
+        stop.defer = True
         Handle.__new__(Handle)  # from now on an error is one
         gc.collect()
         assert "pointer" in capfd.readouterr().err

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from perch_core.component import Action, Client, Component, Service, Wake  # noqa: E402
+from perch_core.component import Action, Client, Component, Service, Timer  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
 from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult  # noqa: E402
@@ -64,7 +64,7 @@ def created(executor, host, kind, wiring=None, **parameters):
 def participant(executor, kind):
     """A node in lockstep whose batches the test begins."""
     wiring = Wiring()
-    wiring.schedule_here = True
+    wiring.hosts_schedule = True
     return created(executor, ParticipantNode, kind, wiring)
 
 
@@ -129,7 +129,7 @@ def test_requests_and_goals_that_a_component_fails_on_are_answered(executor, mak
 class Shaky(Asking):
     """Fails on its first answer and at every tick."""
 
-    tick = Wake(0.1)
+    tick = Timer(0.1)
 
     def on_plan_perch(self, answer) -> None:
         """Keep it; a defect."""

@@ -162,7 +162,7 @@ def test_a_vehicle_that_hovers_elsewhere_has_not_arrived(height):
     while world.outcome is None and world.time < 20.0:
         world.tick()
     assert world.outcome.result is Result.MISSED and world.queries == 0
-    assert "gave up the way to the search place: says so; recovered to a hover" in world.outcome.message
+    assert "left the way to the search place: says so; recovered to a hover" in world.outcome.message
 
 
 def test_a_goal_in_the_air_waits_for_the_estimator():
@@ -266,7 +266,7 @@ def test_a_target_that_was_lost_has_to_be_in_view_for_as_long_again():
 def test_no_target_ends_in_a_hover_after_the_pattern():
     world = World(sees=False)
     world.run()
-    assert world.outcome.result is Result.NOT_FOUND and "no tags seen" in world.outcome.message
+    assert world.outcome.result is Result.NOT_FOUND and "no tags detected" in world.outcome.message
     assert world.controller is ControllerState.TRACKING  # still holding the end of the last search move
 
 
@@ -363,7 +363,7 @@ def test_no_new_plan_undoes_an_abort_before_the_first_plan_begins(replan):
 def test_a_plan_that_the_controller_does_not_take_ends_the_goal(replan):
     world = World(takes=False)
     world.run(Goal(takeoff_height=1.2, search_timeout=6.0, attempts=2, replan=replan))
-    assert world.outcome.result is Result.REFUSED and world.outcome.message.endswith("not taken the plan: says so")
+    assert world.outcome.result is Result.REFUSED and world.outcome.message.endswith("not accepted the plan: says so")
     assert world.time < world.flown[0][0] + 0.6 and world.commands == [Command.ARM, Command.HOVER]
 
 
@@ -406,10 +406,10 @@ def test_adhesion_needs_place_attitude_speed_and_force():
     monitor.add(np.tile([0.0, 0.0, 3.3], (30, 1)))  # thrust alone: falling along the wall
     assert not monitor.attached(at_rest, target)
     monitor.add(np.zeros((30, 3)))
-    assert monitor.fallen_off(State(SURFACE.p_WS, Q_PERCH, np.array([0, 0, -0.6]), np.zeros(3)))
-    assert not monitor.fallen_off(at_rest)  # rocking in what holds it: no force for a moment, and no speed gathered
+    assert monitor.detached(State(SURFACE.p_WS, Q_PERCH, np.array([0, 0, -0.6]), np.zeros(3)))
+    assert not monitor.detached(at_rest)  # rocking in what holds it: no force for a moment, and no speed gathered
     monitor.add(np.tile(g_B, (30, 1)))
-    assert not monitor.fallen_off(State(SURFACE.p_WS, Q_PERCH, np.array([0, 0, -0.6]), np.zeros(3)))
+    assert not monitor.detached(State(SURFACE.p_WS, Q_PERCH, np.array([0, 0, -0.6]), np.zeros(3)))
 
 
 @pytest.mark.parametrize("seen, home", [(True, [0.1, -0.2, 0.0]), (False, [0.1, -0.2, -1.2])])

@@ -386,7 +386,7 @@ def test_a_vehicle_that_was_started_again_ends_the_goal_and_takes_the_next():
     world = World().send().run(3.0)
     world.stamp, world.p, world.flown, world.state = NANOSECONDS, np.zeros(3), None, ControllerState.DISARMED
     world.run(2.0)
-    assert world.goal.ending == "aborted" and "anew" in world.goal.result.message
+    assert world.goal.ending == "aborted" and "restarted" in world.goal.result.message
     world.goal = Sent(PerchGoal())
     world.send().run()
     assert world.goal.ending == "succeeded"

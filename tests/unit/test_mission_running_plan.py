@@ -10,7 +10,7 @@ import pytest
 from perch_control.mission import AdhesionMonitor, Goal, MissionSettings, Plan, Refusal, State, Target
 from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.requests import flown_order
-from perch_control.smooth_position import BEFORE
+from perch_control.smooth_position import START_BEFORE_CONTACT
 from perch_core import so3
 from perch_core.trajectory import SampledTrajectory
 from perch_core.values import AtEnd
@@ -36,7 +36,7 @@ def target(time: float, x: float = 5.0, sigma: float = 0.02) -> Target:
 
 
 def running(length: float = LENGTH) -> RunningPlan:
-    return RunningPlan.begun(answer(START, length), target(9.0), SETTINGS)
+    return RunningPlan.from_plan(answer(START, length), target(9.0), SETTINGS)
 
 
 def answer(start: float, length: float, success: bool = True) -> Plan | Refusal:
@@ -111,8 +111,8 @@ def test_no_new_perch_for_centimetres_nor_at_the_end_nor_unasked(time, x, goal):
 def test_a_target_known_worse_than_the_planned_one_is_not_followed():
     query = running().query(START + 0.1, AT_REST, target(10.0, x=5.26, sigma=0.03), GOAL)
     assert query.recovery
-    assert running().moved(START + 0.1, target(10.0, x=5.06, sigma=0.03), GOAL) is None
-    assert running().moved(START + 0.1, target(10.0, x=5.06, sigma=0.022), GOAL), "out of sight it gets a little less certain, and moves with the map"
+    assert running().shifted(START + 0.1, target(10.0, x=5.06, sigma=0.03), GOAL) is None
+    assert running().shifted(START + 0.1, target(10.0, x=5.06, sigma=0.022), GOAL), "out of sight it gets a little less certain, and moves with the map"
 
 
 @pytest.mark.parametrize("time", [START + 0.1, START + LENGTH - 0.4])
@@ -120,7 +120,7 @@ def test_the_plan_moves_with_the_wire(time):
     plan = running()
     way_out = plan.query(time, AT_REST, None, GOAL)
     assert (way_out is not None) == (time == START + 0.1), "near its end the plan has its own"
-    following = plan.moved(time, target(10.0, x=5.03), GOAL)
+    following = plan.shifted(time, target(10.0, x=5.03), GOAL)
     assert following.plan.end == pytest.approx(plan.plan.end) and following.target.p_WS[0] == 5.03
     assert time - 0.02 < following.plan.start_time <= time, "the rest of it"
     for t in (time, plan.plan.end, plan.plan.end + 0.4):  # the recovery as well
@@ -134,17 +134,17 @@ def test_the_plan_moves_with_the_wire(time):
     (START + 0.1, 5.002, GOAL), (START + 0.1, 5.26, GOAL), (START + LENGTH - 0.1, 5.03, GOAL), (START - 0.1, 5.03, GOAL),
     (START + 0.1, 5.03, Goal(4.2, 30.0, perch_point=np.zeros(3)))])
 def test_the_plan_stays_for_millimetres_for_another_wire_at_the_end_before_its_start_and_unasked(time, x, goal):
-    assert running().moved(time, target(10.0, x=x), goal) is None
+    assert running().shifted(time, target(10.0, x=x), goal) is None
 
 
 def test_the_plan_moves_until_the_controller_flies_on_the_velocity():
     """One instant for both: before it the plan follows the map's corrections, after it the controller leaves them out."""
     for sooner, moves in ((0.01, True), (-0.01, False)):
-        assert (running().moved(START + LENGTH - BEFORE - sooner, target(10.0, x=5.03), GOAL) is not None) == moves
+        assert (running().shifted(START + LENGTH - START_BEFORE_CONTACT - sooner, target(10.0, x=5.03), GOAL) is not None) == moves
 
 
 def test_a_plan_that_was_moved_is_ordered_from_its_states():
-    following = running().moved(START + 1.0, target(10.0, x=5.03), GOAL)
+    following = running().shifted(START + 1.0, target(10.0, x=5.03), GOAL)
     order = flown_order(7, following.plan, 0.25)
     assert (order.id, order.at_end, order.contact_time) == (7, AtEnd.RECOVER, 0.25)
     assert order.recovery_start == pytest.approx(following.plan.end - following.plan.start_time)

@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 from perch_core.errors import PerchError
 from perch_eval import extras
-from perch_setup import alone, machine, progress, slim, stamps, virtualenv, wheel_paths, workspace
+from perch_setup import lock as locking
+from perch_setup import machine, progress, slim, stamps, virtualenv, wheel_paths, workspace
 from perch_setup.errors import SetupError
 from perch_setup.layout import EXTRAS, REQUIREMENTS, ROOT
 from perch_setup.machine import INSTALLED, WHEELS, check_python, check_tools, detect_platform
@@ -68,7 +69,7 @@ def test_a_checkout_that_was_moved_says_why_it_is_set_up_again(repository, monke
     monkeypatch.setattr(prepare.stamps, "environment_stamp", lambda wanted: "stamp")
     monkeypatch.setattr(prepare.virtualenv, "usable", lambda: True)
     monkeypatch.setattr(prepare.virtualenv, "install", lambda wanted, fresh: installed.append(fresh))
-    monkeypatch.setattr(prepare, "remember", lambda wanted: None)
+    monkeypatch.setattr(prepare, "record_installation", lambda wanted: None)
     prepare._install(WHEELS, {"identity": "wheels in /old/place"})
     assert installed == [True] and f"wheels in /old/place, and is now with ROS from wheels in {repository}" in capsys.readouterr().err
     prepare._install(WHEELS, {"identity": f"wheels in {repository}"})
@@ -80,7 +81,7 @@ def test_a_workspace_stays_with_its_installation_in_shells_where_nothing_is_sour
     prefix = tmp_path / "opt"
     (prefix / "share" / "rclpy").mkdir(parents=True)
     (prefix / "setup.bash").touch()
-    machine.remember(INSTALLED, {"AMENT_PREFIX_PATH": f"/overlay:{prefix}"})
+    machine.record_installation(INSTALLED, {"AMENT_PREFIX_PATH": f"/overlay:{prefix}"})
     assert detect_platform({}) is INSTALLED
     (prefix / "setup.bash").unlink()
     assert detect_platform({}) is WHEELS
@@ -240,7 +241,7 @@ def test_an_extra_is_installed_once_and_again_in_a_new_environment(pip, monkeypa
     assert len(pip) == 1 and pip[0][-1] == str(EXTRAS["view"])
     monkeypatch.setattr(virtualenv, "usable", lambda: False)
     monkeypatch.setattr(virtualenv, "install", lambda wanted, fresh: None)
-    monkeypatch.setattr(prepare, "remember", lambda wanted: None)
+    monkeypatch.setattr(prepare, "record_installation", lambda wanted: None)
     prepare._install(WHEELS, done)
     prepare._install_extras(WHEELS, done, ["view"])
     assert len(pip) == 2
@@ -287,7 +288,7 @@ def test_a_package_is_built_from_an_empty_folder(tmp_path, monkeypatch):
     ("[  1%] Generating C code for ROS interfaces\n", None),
 ])
 def test_the_progress_of_a_build_names_the_package_it_is_of(line, words):
-    assert workspace._narrated(line) == words
+    assert workspace._progress(line) == words
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
@@ -357,10 +358,10 @@ def test_a_failing_tool_is_reported_with_its_last_lines_and_its_log(tmp_path, mo
 
 
 def test_a_second_set_up_waits_for_the_first(tmp_path, monkeypatch):
-    monkeypatch.setattr(alone, "STATE", tmp_path)
-    code = (f"import sys, pathlib; sys.path.insert(0, {str(ROOT / 'scripts')!r}); from perch_setup import alone\n"
-            f"alone.STATE = pathlib.Path({str(tmp_path)!r})\nwith alone.alone(): print('inside', flush=True)")
-    with alone.alone():
+    monkeypatch.setattr(locking, "STATE", tmp_path)
+    code = (f"import sys, pathlib; sys.path.insert(0, {str(ROOT / 'scripts')!r}); from perch_setup import lock\n"
+            f"lock.STATE = pathlib.Path({str(tmp_path)!r})\nwith lock.setup_lock(): print('inside', flush=True)")
+    with locking.setup_lock():
         second = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         assert "waiting" in second.stderr.readline()
         assert second.poll() is None
@@ -371,9 +372,9 @@ def test_a_second_set_up_waits_for_the_first(tmp_path, monkeypatch):
 def test_wheel_exports_lose_the_paths_of_the_machine_that_built_them():
     text = ('set_target_properties(a PROPERTIES INTERFACE_INCLUDE_DIRECTORIES "/opt/python/cp311-cp311/include/python3.11;'
             '/opt/python/cp311-cp311/lib/python3.11/site-packages/numpy/_core/include"\n  OTHER "${_IMPORT_PREFIX}/include")')
-    mended = wheel_paths.mend(text, "/usr/include/python3.11", "/venv/numpy")
-    assert '"/usr/include/python3.11;/venv/numpy"' in mended and '"${_IMPORT_PREFIX}/include"' in mended
-    assert wheel_paths.mend(mended, "/usr/include/python3.11", "/venv/numpy") == mended
+    repaired = wheel_paths.repair(text, "/usr/include/python3.11", "/venv/numpy")
+    assert '"/usr/include/python3.11;/venv/numpy"' in repaired and '"${_IMPORT_PREFIX}/include"' in repaired
+    assert wheel_paths.repair(repaired, "/usr/include/python3.11", "/venv/numpy") == repaired
 
 
 def test_equal_libraries_under_several_names_become_one_file(tmp_path):

@@ -179,8 +179,8 @@ NONSENSE = [
     ({"impact_acceleration": 40.0}, PerchPlanError.UNREACHABLE_TILT, "m alpha"),
     ({"thrust_max": 2.3}, PerchPlanError.THRUST_FLOOR, "hover"),
     ({"p": np.array([3.0, 0.0, 1.4])}, X, "1.300 m behind the surface"), ({"v": np.array([50.0, 0.0, 0.0])}, X, "speed"),
-    ({"a": np.array([500.0, 0.0, 0.0])}, B, "thrust|asks for"), ({"j": np.array([1e5, 0.0, 0.0])}, PerchPlanError.BODY_RATE, "already turns"),
-    ({"yaw_rate": 30.0}, PerchPlanError.BODY_RATE, "already turns with 30.0 rad/s"),
+    ({"a": np.array([500.0, 0.0, 0.0])}, B, "thrust|requires"), ({"j": np.array([1e5, 0.0, 0.0])}, PerchPlanError.BODY_RATE, "body rate of the start state"),
+    ({"yaw_rate": 30.0}, PerchPlanError.BODY_RATE, "body rate of the start state is 30.0 rad/s"),
 ]
 
 

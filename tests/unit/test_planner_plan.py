@@ -245,7 +245,7 @@ def test_a_plan_longer_than_duration_max_is_refused_and_says_what_it_would_take(
 
 def test_a_contact_farther_away_than_speed_max_goes_in_duration_max_is_refused_before_the_search():
     waypoints = tuple(Waypoint((-8.0 * (k % 2), 0.0, 1.4)) for k in range(60))
-    with pytest.raises(PerchRefusal, match="longer than speed_max 12 m/s goes in duration_max 20 s") as caught:
+    with pytest.raises(PerchRefusal, match="longer than speed_max 12 m/s covers in duration_max 20 s") as caught:
         plan(PerchProblem(HOVER, surface(90.0), waypoints), PerchSettings(), VEHICLE)
     assert caught.value.code == refusals.BOX and caught.value.iterations == 0
     assert caught.value.margin == pytest.approx(12.0 * 20.0 - (0.1 + 59 * 8.0 + np.hypot(9.7, 0.1) - abs(VEHICLE.perch_offset)))
@@ -296,13 +296,13 @@ def test_a_refusal_solves_a_bounded_number_of_programs_and_names_limits_that_wer
     problem = random_problem(np.random.default_rng(seed))
     with pytest.raises(PerchRefusal) as caught:
         plan(problem, PerchSettings(), VEHICLE)
-    assert len(solved) <= search.ITERATIONS_MAX + relaxation.PROGRAMS
+    assert len(solved) <= search.ITERATIONS_MAX + relaxation.PROGRAMS_MAX
     assert caught.value.relaxed
     checked(problem, PerchSettings(**caught.value.relaxed))
 
 
 def test_a_refusal_whose_programs_are_used_up_names_limits_without_which_there_is_a_plan(monkeypatch):
-    monkeypatch.setattr(relaxation, "PROGRAMS", 10)
+    monkeypatch.setattr(relaxation, "PROGRAMS_MAX", 10)
     problem = random_problem(np.random.default_rng(20010))
     with pytest.raises(PerchRefusal) as caught:
         plan(problem, PerchSettings(), VEHICLE)

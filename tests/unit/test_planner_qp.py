@@ -112,7 +112,7 @@ def test_a_program_that_starts_at_the_multipliers_of_another_has_the_same_minimu
 
 
 def test_multipliers_follow_the_keys_of_their_rows():
-    carried = segment_program._carried(np.array([2, 5, 7]), np.array([1.0, -2.0, 3.0]), np.array([1, 5, 6, 7, 9]))
+    carried = segment_program._transfer_multipliers(np.array([2, 5, 7]), np.array([1.0, -2.0, 3.0]), np.array([1, 5, 6, 7, 9]))
     assert carried.tolist() == [0.0, -2.0, 0.0, 3.0, 0.0]
 
 

@@ -16,7 +16,7 @@ from perch_core.rotor_model import RotorModel, derivative, hover_state
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import guess
 from perch_planner.powerline.certificate import certify, certify_end
-from perch_planner.powerline.flight import fly
+from perch_planner.powerline.flight import simulate
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 from perch_planner.powerline.validation import check_request
@@ -54,7 +54,7 @@ def test_the_gripper_is_where_plans_bring_it() -> None:
 def test_flight_agrees_with_an_adaptive_integrator() -> None:
     rng = np.random.default_rng(0)
     start, rates, T = hover_state(MODEL, np.zeros(3), LEVEL), rng.uniform(-6, 6, (5, 4)), 0.5
-    times, states, inputs = fly(MODEL, start, rates, T)
+    times, states, inputs = simulate(MODEL, start, rates, T)
     x = start
     for row in rates:
         x = solve_ivp(lambda _, y: stack(derivative(MODEL, components(y), components(row))), (0, T / 5), x,
@@ -134,7 +134,7 @@ def test_a_guess_upside_down_leans_back_though_the_wire_is_inclined() -> None:
 
 def test_guesses_turn_as_their_body_rates_say() -> None:
     start = hover_state(MODEL, np.array([0.0, 0, 4]), so3.quat_exp([0, 0, 0.3]))
-    perch, _ = guess.perch_guess(MODEL, start, np.array([4.0, 0, 4.2]), np.array([-0.8, 0, 0.6]), 0.85, 60, aside=0.5)
+    perch, _ = guess.perch_guess(MODEL, start, np.array([4.0, 0, 4.2]), np.array([-0.8, 0, 0.6]), 0.85, 60, b3_turn=0.5)
     leaving, _ = guess.recovery_guess(MODEL, perch[-1, :17], np.array([0.0, 0, 4]), 0.85, 60)
     for states in (perch, leaving):
         h = states[0, 17] / 60

@@ -95,7 +95,7 @@ def test_a_perch_after_which_no_recovery_is_found_is_given_without_one() -> None
     planner = PowerlinePlanner(VEHICLE, config.replace(SETUP.settings, recovery_duration=(0.01, 0.02)))
     plan = planner.plan(REQUEST)
     assert plan.recovery is None and "no recovery" in plan.without_recovery and all(bound.holds for bound in plan.bounds)
-    answer = service.answer(plan, planner.solver.model, 0)
+    answer = service.plan_response(plan, planner.solver.model, 0)
     assert answer.success and answer.at_end == AtEnd.CONTACT and answer.recovery_start < 0.0
     assert "without recovery: no recovery" in answer.message
     assert plan_answer(answer) == Refusal(answer.message)

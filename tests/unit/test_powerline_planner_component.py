@@ -253,13 +253,13 @@ def test_what_nobody_had_foreseen_is_a_refusal(ask: Asked, monkeypatch: pytest.M
 
 
 def test_a_planner_is_loaded_once_whatever_may_change(ask: Asked) -> None:
-    powerline_planner.planner_of.cache_clear()
+    powerline_planner.cached_planner.cache_clear()
     changed = PowerlinePlannerComponent(PowerlinePlannerParameters(deadline=3.0))
     ask.component.preload()()
     changed.preload()()
-    assert powerline_planner.planner_of.cache_info().misses == 1
+    assert powerline_planner.cached_planner.cache_info().misses == 1
     ask.component.reconfigure(PowerlinePlannerParameters(deadline=4.0))
-    assert ask(request()).success and powerline_planner.planner_of.cache_info().misses == 1
+    assert ask(request()).success and powerline_planner.cached_planner.cache_info().misses == 1
 
 
 @pytest.mark.parametrize(("changes", "words"), [(dict(camera="rear"), "no camera"), (dict(vehicle="snapdragon"), "thrust_rate_max")])

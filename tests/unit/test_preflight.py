@@ -12,7 +12,7 @@ from perch_core.values import CameraModel, ControllerStatus, ImuSample
 from perch_core.vehicle import load_vehicle
 from perch_eval.preflight import checks, command
 from perch_eval.camera_turns import CameraTurns, rotation_between
-from perch_eval.preflight.checks import Order, Verdict
+from perch_eval.preflight.checks import CommandResult, Verdict
 from scipy.spatial.transform import Rotation
 
 VEHICLE = load_vehicle("snapdragon")
@@ -38,19 +38,19 @@ def still(R=np.eye(3), scale=1.0, spin=0.0, seed=1):
 @pytest.mark.parametrize("k", range(24))
 def test_every_wrong_axis_is_found_by_gravity_or_by_shaking(k):
     R = AXES[k]
-    seen = verdicts(checks.rest(still(R)))
+    seen = verdicts(checks.check_at_rest(still(R)))
     assert seen["gravity's size"] is PASSED and seen["gyroscope at rest"] is PASSED
     assert (seen["gravity up"] is PASSED) == (R[2, 2] == 1.0)
     rng = np.random.default_rng(k)
     rates = rng.standard_normal((60, 3))  # of the body; its IMU says R of it, the camera what its mount makes of it
-    check = checks.shaken("down", rates @ R.T + 0.02 * rng.standard_normal((60, 3)), rates @ VEHICLE.mounts["down"].R_BC, VEHICLE)
+    check = checks.check_rotation("down", rates @ R.T + 0.02 * rng.standard_normal((60, 3)), rates @ VEHICLE.mounts["down"].R_BC, VEHICLE)
     assert (check.verdict is PASSED) == bool((R == np.eye(3)).all())
 
 
 def test_units_and_motion_are_seen():
-    assert verdicts(checks.rest(still(scale=1 / 9.81)))["gravity's size"] is FAILED
-    assert verdicts(checks.rest(still(spin=0.2)))["gyroscope at rest"] is FAILED
-    assert verdicts(checks.rest([]))["gravity up"] is FAILED
+    assert verdicts(checks.check_at_rest(still(scale=1 / 9.81)))["gravity's size"] is FAILED
+    assert verdicts(checks.check_at_rest(still(spin=0.2)))["gyroscope at rest"] is FAILED
+    assert verdicts(checks.check_at_rest([]))["gravity up"] is FAILED
 
 
 @pytest.mark.parametrize("stamps, rate, even", [
@@ -58,13 +58,13 @@ def test_units_and_motion_are_seen():
     ([k * 2 * MS + 30 * MS * (k > 200) for k in range(500)], PASSED, FAILED),
                                                 ([k * 2 * MS - 4 * MS * (k == 200) for k in range(500)], PASSED, FAILED)])
 def test_rates_and_stamps(stamps, rate, even):
-    assert list(verdicts(checks.stream("imu/data_raw", stamps)).values()) == [rate, even]
+    assert list(verdicts(checks.check_stream("imu/data_raw", stamps)).values()) == [rate, even]
 
 
 def test_silence_fails():
-    assert [check.verdict for check in checks.stream("odometry", [])] == [FAILED]
-    assert [check.verdict for check in checks.frames(None, still()[0], True)] == [FAILED, PASSED]
-    assert checks.frames(None, still()[0]._replace(frame="fcu"), False)[1].verdict is FAILED
+    assert [check.verdict for check in checks.check_stream("odometry", [])] == [FAILED]
+    assert [check.verdict for check in checks.check_frames(None, still()[0], True)] == [FAILED, PASSED]
+    assert checks.check_frames(None, still()[0]._replace(frame="fcu"), False)[1].verdict is FAILED
 
 
 @pytest.mark.parametrize("shift, verdict", [(0.03, PASSED), (0.6, FAILED), (-0.4, FAILED), (1.7e9, FAILED)])
@@ -72,24 +72,24 @@ def test_clocks_are_compared_though_this_program_is_late(shift, verdict):
     rng = np.random.default_rng(5)
     imu = [(100.0 + 0.002 * k + rng.exponential(0.05), k * 2 * MS) for k in range(1000)]
     frames = [(100.0 + 0.033 * k + shift + rng.exponential(0.05), k * 33 * MS) for k in range(60)]
-    assert [check.verdict for check in checks.clocks(imu, {"down": frames})] == [verdict]
+    assert [check.verdict for check in checks.check_clocks(imu, {"down": frames})] == [verdict]
 
 
 def test_cameras_and_extrinsics_are_compared_with_the_file():
     camera = VEHICLE.mounts["down"].camera
     model = CameraModel(0, "camera_down_optical_frame", camera)
-    assert checks.camera_model("down", model, VEHICLE).verdict is PASSED
+    assert checks.check_camera_model("down", model, VEHICLE).verdict is PASSED
     c = camera
     other_lens = PinholeCamera(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
     for wrong in (replace(c, fx=1.1 * c.fx), replace(c, cx=c.cx + 80.0), other_lens, replace(c, width=c.width + 2)):
-        assert checks.camera_model("down", model._replace(camera=wrong), VEHICLE).verdict is FAILED
+        assert checks.check_camera_model("down", model._replace(camera=wrong), VEHICLE).verdict is FAILED
     for wrong in (model._replace(frame="down"), None):
-        assert checks.camera_model("down", wrong, VEHICLE).verdict is FAILED
+        assert checks.check_camera_model("down", wrong, VEHICLE).verdict is FAILED
     frames = list(fixed_frames(VEHICLE))
-    assert {check.verdict for check in checks.extrinsics(frames, VEHICLE)} == {PASSED}
-    assert {check.verdict for check in checks.extrinsics([], VEHICLE)} == {OPEN}
+    assert {check.verdict for check in checks.check_extrinsics(frames, VEHICLE)} == {PASSED}
+    assert {check.verdict for check in checks.check_extrinsics([], VEHICLE)} == {OPEN}
     moved = [f._replace(p=(f.p[0] + 0.05, *f.p[1:])) if f.child.startswith("camera_front") else f for f in frames]
-    failed = [check.name for check in checks.extrinsics(moved, VEHICLE) if check.verdict is FAILED]
+    failed = [check.name for check in checks.check_extrinsics(moved, VEHICLE) if check.verdict is FAILED]
     assert failed == ["extrinsics camera_front_optical_frame"]
 
 
@@ -98,14 +98,14 @@ def test_cameras_and_extrinsics_are_compared_with_the_file():
     (lambda w, other: w + 0.6 * other, "are not the camera's")])
 def test_a_gyroscope_with_another_scale_or_another_motion_is_found(felt, words):
     rates, other = np.random.default_rng(6).standard_normal((2, 60, 3))
-    check = checks.shaken("down", felt(rates, other), rates @ VEHICLE.mounts["down"].R_BC, VEHICLE)
-    assert check.verdict is FAILED and words in check.seen
+    check = checks.check_rotation("down", felt(rates, other), rates @ VEHICLE.mounts["down"].R_BC, VEHICLE)
+    assert check.verdict is FAILED and words in check.observation
 
 
 def test_shaking_too_little_is_no_verdict():
     rates = np.outer(np.sin(np.arange(60)), (1.0, 0.0, 0.0))  # about one axis alone
-    assert checks.shaken("down", rates, rates, VEHICLE).verdict is OPEN and checks.shaken("down", rates[:5], rates[:5],
-                                                                                          VEHICLE).verdict is OPEN
+    assert checks.check_rotation("down", rates, rates, VEHICLE).verdict is OPEN
+    assert checks.check_rotation("down", rates[:5], rates[:5], VEHICLE).verdict is OPEN
 
 
 def test_rotations_are_found_among_false_rays():
@@ -140,19 +140,19 @@ class Graph:
     """A vehicle that obeys, or does not."""
 
     def __init__(self, obeys=True):
-        self.orders, self.obeys = [], obeys
+        self.commands, self.obeys = [], obeys
 
-    def order(self, order, state):
-        self.orders.append(order)
+    def send_command(self, sent, state):
+        self.commands.append(sent)
         status = ControllerStatus(0, state if self.obeys else 0, "geometric", 0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, "said")
-        return Order(status, 0.1, state == command.State.ARMED and self.obeys)
+        return CommandResult(status, 0.1, state == command.State.ARMED and self.obeys)
 
-    def await_takeover(self, patience):
-        assert self.orders[-1] == command.Command.ARM
+    def await_takeover(self, timeout):
+        assert self.commands[-1] == command.Command.ARM
         return True, True
 
-    def await_end_of_commands(self, patience):
-        assert self.orders[-1] == command.Command.ARM
+    def await_end_of_commands(self, timeout):
+        assert self.commands[-1] == command.Command.ARM
         return 10.0, 10.4
 
 
@@ -165,34 +165,34 @@ ALL = asked("--props-off", "--takeover", "--watchdog")
 
 def test_motors_start_only_where_the_propellers_are_off():
     graph = Graph()
-    assert {check.verdict for check in command.exercised(graph, asked("--takeover", "--watchdog"))} == {OPEN} and not graph.orders
-    seen = verdicts(command.exercised(graph, ALL))
+    assert {check.verdict for check in command.active_checks(graph, asked("--takeover", "--watchdog"))} == {OPEN} and not graph.commands
+    seen = verdicts(command.active_checks(graph, ALL))
     assert [seen[name] for name in ("armed state", "disarming", "kill", "pilot's takeover", "watchdog")] == [PASSED] * 5
-    assert graph.orders[-1] == command.Command.KILL, "it is left with the motors off"
+    assert graph.commands[-1] == command.Command.KILL, "it is left with the motors off"
 
 
 def test_who_does_not_arm_fails_and_is_not_tried_further():
     graph = Graph(obeys=False)
-    seen = verdicts(command.exercised(graph, ALL))
+    seen = verdicts(command.active_checks(graph, ALL))
     assert seen["armed state"] is FAILED and seen["watchdog"] is seen["pilot's takeover"] is OPEN
-    assert graph.orders == [command.Command.ARM, command.Command.DISARM, command.Command.ARM]
+    assert graph.commands == [command.Command.ARM, command.Command.DISARM, command.Command.ARM]
 
 
 @pytest.mark.parametrize("turned, armed, verdict", [(True, True, PASSED), (True, None, FAILED), (True, False, OPEN), (False, None, OPEN)])
 def test_motors_that_go_on_though_the_pilot_has_taken_over_fail(turned, armed, verdict):
-    assert checks.taken_over(turned, armed).verdict is verdict
+    assert checks.check_takeover(turned, armed).verdict is verdict
 
 
 @pytest.mark.parametrize("motion, verdict", [(10.3, PASSED), (11.5, FAILED), (None, OPEN)])
 def test_motors_that_go_on_without_commands_fail(motion, verdict):
-    assert checks.stopped(10.0, motion).verdict is verdict
+    assert checks.check_watchdog(10.0, motion).verdict is verdict
 
 
 def test_an_autopilot_may_descend_before_its_motors_stop():
     graph = Graph()
-    graph.await_end_of_commands = lambda patience: (10.0, 14.2)  # its watchdog's four seconds
-    assert verdicts(command.exercised(graph, ALL))["watchdog"] is FAILED
-    assert verdicts(command.exercised(graph, ALL, checks.DESCENDED))["watchdog"] is PASSED
+    graph.await_end_of_commands = lambda timeout: (10.0, 14.2)  # its watchdog's four seconds
+    assert verdicts(command.active_checks(graph, ALL))["watchdog"] is FAILED
+    assert verdicts(command.active_checks(graph, ALL, checks.DESCENT_TIME))["watchdog"] is PASSED
 
 
 @pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"),

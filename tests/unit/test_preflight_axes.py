@@ -95,14 +95,14 @@ def refused(seen: Seen, monkeypatch, capsys, axes: np.ndarray = np.eye(3), file:
                            for channel in listener.CHANNELS}
             self.turns = CameraTurns(MOUNT.camera)
 
-        def watch(self, camera, model) -> None:
+        def subscribe_camera(self, camera, model) -> None:
             self.turns.spans = seen.spans
             self.values["imu/data_raw"] += [(1e-9 * one.stamp, one) for one in read(seen.shaken)]
 
-        def listen(self, duration: float) -> None:
+        def spin_for(self, duration: float) -> None:
             pass
 
-        def await_first(self, channel: str, patience: float) -> None:
+        def await_first(self, channel: str, timeout: float) -> None:
             pass
 
         def close(self) -> None:
@@ -155,10 +155,10 @@ def test_a_wrong_sign_is_seen_about_the_axis_that_is_turned_about_least(axis):
     rates, sign = np.random.default_rng(axis).standard_normal((60, 3)), np.ones(3)
     rates[:, axis] *= 0.5
     sign[axis] = -1.0
-    check = checks.shaken("front", rates * sign, rates @ MOUNT.R_BC, VEHICLE)
-    assert check.verdict is checks.Verdict.FAILED and "left-handed" in check.seen
+    check = checks.check_rotation("front", rates * sign, rates @ MOUNT.R_BC, VEHICLE)
+    assert check.verdict is checks.Verdict.FAILED and "left-handed" in check.observation
     rates[:, axis] *= 0.4
-    assert checks.shaken("front", rates * sign, rates @ MOUNT.R_BC, VEHICLE).verdict is checks.Verdict.OPEN, "not turned about enough"
+    assert checks.check_rotation("front", rates * sign, rates @ MOUNT.R_BC, VEHICLE).verdict is checks.Verdict.OPEN, "not turned about enough"
 
 
 @pytest.mark.parametrize("by", ["frame", "file"])

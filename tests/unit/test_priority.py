@@ -21,7 +21,7 @@ def started(name):
     return begun.get()
 receives, sends_large = started("dds.udp.7412"), started("dds.asyn.0.0")
 own = Priority(); own.nodes = 1
-problem = own.ask()
+problem = own.raise_priority()
 later = threading.Thread(target=release.wait); later.start()
 policies = {name: os.sched_getscheduler(task) & ~os.SCHED_RESET_ON_FORK for name, task in (
     ("loop", os.getpid()), ("receives", receives), ("drawing", drawing.native_id), ("later", later.native_id), ("sends large", sends_large))}
@@ -39,7 +39,7 @@ def test_the_loop_and_the_middleware_are_raised_but_not_python_s_threads_nor_wha
 
 def test_a_process_with_other_work_is_left_alone():
     before = os.sched_getscheduler(0)
-    assert Priority().ask() == ""
+    assert Priority().raise_priority() == ""
     assert os.sched_getscheduler(0) == before != os.SCHED_FIFO
 
 
@@ -48,13 +48,13 @@ import os
 from perch_core.ros.priority import NICE, Priority
 nice = lambda task: os.getpriority(os.PRIO_PROCESS, task)
 before = nice(os.getpid())
-Priority().give_way()
+Priority().lower_priority()
 assert nice(os.getpid()) == before, 'a process with other work is left alone'
 composed = Priority(); composed.nodes = 3
-composed.give_way()
+composed.lower_priority()
 assert nice(os.getpid()) == before, 'neighbours may be in a hurry'
 own = Priority(); own.nodes = 1
-own.give_way()
+own.lower_priority()
 assert nice(os.getpid()) == NICE
 assert os.sched_getscheduler(0) == os.SCHED_BATCH, 'it interrupts nobody'
 """

@@ -72,16 +72,16 @@ def test_a_request_waits_for_the_discovery_of_its_service(executor):
 
 
 def test_a_service_that_nobody_offers_is_named(executor, monkeypatch):
-    monkeypatch.setattr("perch_core.ros.asking.DISCOVERY", 0.1)
+    monkeypatch.setattr("perch_core.ros.service_clients.DISCOVERY_TIMEOUT", 0.1)
     asking = node(executor, Asking).component
     asking.plan_perch(REQUEST, 0)
     until(executor, lambda: getattr(asking, "answers", []))
-    assert asking.answers == [Unavailable("service plan_perch is not there")]
+    assert asking.answers == [Unavailable("service plan_perch is not available")]
 
 
 @pytest.mark.slow
 def test_a_server_that_is_started_anew_while_nobody_asks_is_told(executor, monkeypatch):
-    monkeypatch.setattr("perch_core.ros.asking.WATCH", 0.02)
+    monkeypatch.setattr("perch_core.ros.service_clients.WATCH_PERIOD", 0.02)
     asking, told = node(executor, Asking), []
     asking.component.log.receivers.append(lambda line: told.append(line.text))
     first = node(executor, Serving)
@@ -92,7 +92,7 @@ def test_a_server_that_is_started_anew_while_nobody_asks_is_told(executor, monke
     executor.remove_node(first), close_nodes([first])
     node(executor, Serving)
     until(executor, lambda: told)
-    assert told == ["plan_perch: another node answers from now on: it was started anew, or is a second one"]
+    assert told == ["plan_perch: server restarted or second server detected"]
 
 
 class Silent(Serving):

@@ -77,7 +77,7 @@ class Became(Exception):
 
 @pytest.mark.parametrize("node, package", [("betaflight", "perch_autopilot"), ("mavlink", "perch_autopilot"), ("controller", "perch_control")])
 def test_every_node_can_be_started_without_the_ros2_command(node, package, monkeypatch):
-    def become(path: str, words: list[str]) -> None:
+    def exec_program(path: str, words: list[str]) -> None:
         raise Became(path, words)
 
     monkeypatch.syspath_prepend(str(SCRIPTS))
@@ -85,7 +85,7 @@ def test_every_node_can_be_started_without_the_ros2_command(node, package, monke
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
     monkeypatch.setattr(script, "enter", lambda *_: None)
-    monkeypatch.setattr(script, "become", become)
+    monkeypatch.setattr(script, "exec_program", exec_program)
     monkeypatch.setattr(sys, "argv", ["run_node.py", node, "--ros-args", "-p", "link:=/dev/ttyACM0"])
     with pytest.raises(Became) as started:
         script.main()

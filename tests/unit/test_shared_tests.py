@@ -31,15 +31,15 @@ def test_every_file_is_in_one_part_and_every_part_is_there():
 
 
 def test_every_part_is_taken_once():
-    share = script.Share(script.parts(FILES), 2)
-    assert [share.take() for _ in script.parts(FILES)] == script.parts(FILES) and share.take() is None
+    workers = script.WorkerPlugin(script.parts(FILES), 2)
+    assert [workers.next_part() for _ in script.parts(FILES)] == script.parts(FILES) and workers.next_part() is None
 
 
 PROGRAM = """
 import os, sys, pytest, test
 sys.first = os.getpid()
-share = test.Share(PARTS, 2)
-share.end(test.run_pytest(["--rootdir=.", "-c", "/dev/null", "-rA", "."], share))
+workers = test.WorkerPlugin(PARTS, 2)
+workers.end(test.run_pytest(["--rootdir=.", "-c", "/dev/null", "-rA", "."], workers))
 """
 GOOD, BAD, BROKEN = "def test_{0}(one): assert one", "def test_{0}(): assert False", "import no_such_module"
 SHARED = "import pytest\n@pytest.fixture\ndef one(): return 1\n"

@@ -68,7 +68,7 @@ def test_nothing_is_made_for_nobody():
     for name, wanted in asked.items():
         emitter = getattr(flown, name)
         emitter.receivers.append(made[name].append)
-        emitter.asked = lambda wanted=wanted: wanted
+        emitter.receiver_check = lambda wanted=wanted: wanted
     for _ in range(10):
         flown.advance()
     assert {name: len(values) for name, values in made.items()} == {"imu": 10, "truth": 0, "rotors": 0}

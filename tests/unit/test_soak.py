@@ -14,10 +14,10 @@ def flights(memory, descriptors=lambda k: 10, good=lambda k: True):
 
 
 def test_what_grows_is_found():
-    assert soak.verdicts(flights(lambda k: 100.0 + min(k, 50))) == []  # what grows at first only
-    assert soak.verdicts(flights(lambda k: 100.0 + 0.02 * k)) == ["all: memory grows by 2.00 MB per 100 flights"]
-    assert soak.verdicts(flights(lambda k: 100.0, lambda k: 10 + (k > 140))) == ["all: descriptors between 10 and 11"]
-    assert soak.verdicts(flights(lambda k: 100.0, good=lambda k: k != 7)) == ["flight 8: missed, no departure: "]
+    assert soak.find_problems(flights(lambda k: 100.0 + min(k, 50))) == []  # what grows at first only
+    assert soak.find_problems(flights(lambda k: 100.0 + 0.02 * k)) == ["all: memory grows by 2.00 MB per 100 flights"]
+    assert soak.find_problems(flights(lambda k: 100.0, lambda k: 10 + (k > 140))) == ["all: descriptors between 10 and 11"]
+    assert soak.find_problems(flights(lambda k: 100.0, good=lambda k: k != 7)) == ["flight 8: missed, no departure: "]
 
 
 def test_a_slope_needs_flights():

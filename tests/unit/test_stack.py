@@ -124,8 +124,8 @@ def test_exit_code_2_is_the_caller_s_mistake(tmp_path):
     with Stack([python("node", "raise SystemExit(2)", nodes=("/node",))], tmp_path) as stack:
         with pytest.raises(StackError) as error:
             stack.wait_until_ready(set, timeout=PATIENCE)
-    assert error.value.callers_mistake
-    assert not StackError("other").callers_mistake
+    assert error.value.refused_input
+    assert not StackError("other").refused_input
 
 
 def test_an_executable_that_does_not_exist_is_named_and_nothing_stays(tmp_path):

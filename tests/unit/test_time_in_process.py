@@ -46,7 +46,7 @@ def test_time_of_a_clock_in_the_process_is_known_at_once_and_without_a_subscript
     listening = ArrivalNode("listening", Listening, wiring, context=context, parameter_overrides=simulated)
     ticking = ArrivalNode("ticking", Ticking, wiring if together else Wiring(), context=context)
     try:
-        listening.take_time_here()
+        listening.use_local_clock()
         topics = [subscription.topic_name for subscription in listening.subscriptions]
         ticking.component.clock(7_000_000_123)
         assert ("/clock" in topics) is not together

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 from perch_core.ros import shared_memory
-from perch_core.ros.shared_memory import end_unfinished
+from perch_core.ros.shared_memory import remove_unfinished_segments
 from perch_eval.domain import reserved_domain
 
 PLAIN = "import rclpy; rclpy.init(); rclpy.create_node('one'); print('there'); rclpy.shutdown()"
-OURS = "from perch_core.ros.shared_memory import end_unfinished; end_unfinished(); " + PLAIN
+OURS = "from perch_core.ros.shared_memory import remove_unfinished_segments; remove_unfinished_segments(); " + PLAIN
 
 
 @pytest.fixture
@@ -33,17 +33,17 @@ def test_only_ports_that_are_unfinished_are_ended(tmp_path):
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
     waiting = (tmp_path / "fastrtps_port7411").open("rb")
-    assert {file.name for file in end_unfinished(tmp_path)} == {"fastrtps_port7411", "fastdds_port7413", "fastrtps_port7415"}
+    assert {file.name for file in remove_unfinished_segments(tmp_path)} == {"fastrtps_port7411", "fastdds_port7413", "fastrtps_port7415"}
     assert {file.name for file in tmp_path.iterdir()} == set(list(contents)[3:])
     assert waiting.read(4) == b"\3\0\0\0"
-    assert end_unfinished(tmp_path / "none") == end_unfinished(tmp_path) == []
+    assert remove_unfinished_segments(tmp_path / "none") == remove_unfinished_segments(tmp_path) == []
 
 
 def test_one_that_is_finished_in_time_stays(tmp_path, monkeypatch):
     file = tmp_path / "fastrtps_port7411"
     file.write_bytes(bytes(64))
     monkeypatch.setattr(shared_memory.time, "sleep", lambda duration: file.write_bytes(b"\2" + bytes(63)))
-    assert end_unfinished(tmp_path) == [] and file.exists()
+    assert remove_unfinished_segments(tmp_path) == [] and file.exists()
 
 
 def test_our_nodes_start(ports):
@@ -62,5 +62,5 @@ def test_who_waits_goes_on_when_one_of_ours_starts(ports):
         while not any(str(file) in Path(f"/proc/{waiting.pid}/maps").read_text() for file in files):  # it has one open
             assert waiting.poll() is None
             time.sleep(0.05)
-        end_unfinished()
+        remove_unfinished_segments()
         assert waiting.communicate(timeout=300)[0] == b"there\n"

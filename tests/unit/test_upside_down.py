@@ -66,7 +66,7 @@ def failed(loop, fault, lasting):
     lying = loop.time
     while flight.state is not State.FAILED and loop.time < lying + 1.5:
         loop.step()
-    return flight.state, flight.flown.message
+    return flight.state, flight.flight_state.message
 
 
 @pytest.mark.parametrize("fault, lasting", [(upside_down, None), (imu_fails, 1.0), (imu_fails, math.inf), (controller_stops, 0.6),

@@ -183,7 +183,7 @@ def test_the_debug_image_is_drawn_for_those_who_look():
     image = flight.out["debug_image"][-1]
     assert (image.encoding, image.pixels().shape) == ("bgr8", (480, 640, 3))
     unwatched = Flight()
-    unwatched.component.debug_image.asked = lambda: False
+    unwatched.component.debug_image.receiver_check = lambda: False
     assert unwatched.fly(1.0).out["debug_image"] == []
 
 

@@ -138,8 +138,8 @@ def test_the_ground_tells_nothing_and_breaks_nothing():
     assert len(ground) > 10
     for step in ground:
         assert step.result.features < 10
-        assert np.linalg.norm(step.error[:3] + flight().told_wrong[:3]) < 5e-3
-    assert np.linalg.norm(np.mean([step.error[:3] for step in ground], axis=0) + flight().told_wrong[:3]) < 2e-3
+        assert np.linalg.norm(step.error[:3] + flight().start_error[:3]) < 5e-3
+    assert np.linalg.norm(np.mean([step.error[:3] for step in ground], axis=0) + flight().start_error[:3]) < 2e-3
 
 
 def test_the_same_frames_give_the_same_bits():

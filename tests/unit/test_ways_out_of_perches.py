@@ -18,7 +18,7 @@ from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.control_flights.aborted import fly_aborted
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState
 from perch_planner.refusals import PerchRefusal
-from perch_planner.way_out import AWAY, plan_way_out
+from perch_planner.way_out import STANDOFF_MIN, plan_way_out
 
 VEHICLE, SETTINGS = load_vehicle("snapdragon"), PerchSettings()
 PLAN = perch("surface_90_1.7m")
@@ -40,7 +40,7 @@ def test_a_way_out_continues_the_plan_keeps_the_limits_and_ends_at_rest_away_fro
     for name in ("p", "v", "a", "j"):
         np.testing.assert_allclose(getattr(first, name), getattr(before, name), atol=1e-6)
     np.testing.assert_allclose([last.v, last.a], 0.0, atol=1e-6)
-    assert (last.p - WALL.p_WS) @ WALL.normal >= AWAY - 1e-9
+    assert (last.p - WALL.p_WS) @ WALL.normal >= STANDOFF_MIN - 1e-9
     for s in np.linspace(0.0, found.trajectory.duration, 400):
         x = found.trajectory.sample(s)
         force = VEHICLE.mass * (x.a + (0.0, 0.0, GRAVITY))

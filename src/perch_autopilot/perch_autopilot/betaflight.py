@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
+from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
 from perch_core.values import NANOSECONDS, ImuSample, RatesThrust
 from perch_core.vehicle import GRAVITY
@@ -43,7 +43,7 @@ class Betaflight(Component[BetaflightParameters]):
     config_type = BetaflightParameters
 
     rates_thrust = Input(RatesThrust, "rates_thrust_command")
-    poll = Wake(0.01)
+    poll = Timer(0.01)
     imu = Output(ImuSample, "imu/data_raw")
 
     def __init__(self, config: BetaflightParameters) -> None:
@@ -111,7 +111,7 @@ class Betaflight(Component[BetaflightParameters]):
         """On to the autopilot, until the next, or until it is stale."""
         values = (*command.w_B, command.thrust)
         if not sum(value * value for value in values) < 1e8:
-            self.warn(f"rates_thrust_command: {values} is not finite, or beyond any vehicle: ignored", every=1.0)
+            self.warn(f"rates_thrust_command: {values} is not finite, or beyond any vehicle: ignored", min_interval=1.0)
             return
         self._wanted = command.armed
         sticks = self._sticks.channels(command.w_B, command.thrust) if command.armed else CENTRED
@@ -180,7 +180,7 @@ class Betaflight(Component[BetaflightParameters]):
                 self._battery = msp.battery(frame)
                 self._take_battery(self._battery.voltage)
         except msp.MspError as error:
-            self.warn(str(error), every=1.0)
+            self.warn(str(error), min_interval=1.0)
 
     def _take_battery(self, voltage: float) -> None:
         if self._sticks.battery.reference:
@@ -207,7 +207,7 @@ class Betaflight(Component[BetaflightParameters]):
             self.log(LogLine("error", f"{self.config.link}: the autopilot is silent: check its power and its link", 5.0))
         if self._parser.torn > self._torn:
             self._torn = self._parser.torn
-            self.warn(f"{self.config.link}: torn frames come from the autopilot: check the link and its baud rate", every=5.0)
+            self.warn(f"{self.config.link}: torn frames come from the autopilot: check the link and its baud rate", min_interval=5.0)
         values = {"firmware": str(self.version), "mode": self._mode, "torn_frames": self._parser.torn,
                   "skipped_bytes": self._parser.skipped}
         if self._status is not None:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
+from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, ImuSample, OdometryState, RatesThrust
@@ -77,7 +77,7 @@ class Mavlink(Component[MavlinkParameters]):
 
     rates_thrust = Input(RatesThrust, "rates_thrust_command")
     odometry = Input(OdometryState, "odometry")
-    poll = Wake(0.005)
+    poll = Timer(0.005)
     imu = Output(ImuSample, "imu/data_raw")
 
     def __init__(self, config: MavlinkParameters) -> None:
@@ -125,7 +125,7 @@ class Mavlink(Component[MavlinkParameters]):
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Sent with the next poll, until it is stale."""
         if not sum(value * value for value in (*command.w_B, command.thrust)) < 1e8:
-            self.warn("rates_thrust_command: not finite, or beyond any vehicle: ignored", every=1.0)
+            self.warn("rates_thrust_command: not finite, or beyond any vehicle: ignored", min_interval=1.0)
             return
         self._command, self._came = command, self._now or 0
 
@@ -267,7 +267,7 @@ class Mavlink(Component[MavlinkParameters]):
         if (trouble := self._trouble(now)) and now - self._begun >= SILENT * NANOSECONDS:
             self.log(LogLine("error", trouble, 5.0))
         elif not trouble and self._torn > self._named:
-            self.warn("torn frames come from the autopilot: check the link and its baud rate", every=5.0)
+            self.warn("torn frames come from the autopilot: check the link and its baud rate", min_interval=5.0)
             self._named = self._torn
         self.diagnostics(Diagnostics(now, {"armed": self.offboard.armed, "following": self.offboard.following, "torn_frames": self._torn,
                                            "clock_offset_s": (self._clock.offset or 0) * 1e-9},

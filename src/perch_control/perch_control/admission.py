@@ -13,10 +13,10 @@ from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import AtEnd, TrajectoryOrder, limits
 from perch_core.vehicle import Vehicle
 
-_EARLIEST = 60.0        # a trajectory is not kept for longer before its start [s]
-LATEST = 0.5            # the oldest start that is flown: a plan is of the present [s]
+_START_AHEAD_MAX = 60.0  # a trajectory is not kept for longer before its start [s]
+START_DELAY_MAX = 0.5   # a trajectory is not flown where its start lies further in the past [s]
 START_GAP = 0.35        # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
-CONTACT_EARLY = 0.15    # a contact may come so long before the plan has it [s]
+CONTACT_EARLY = 0.15    # a contact may occur so long before the planned one [s]
 _START_SPEED_GAP = 1.0  # the same for the velocity [m/s]
 _STEP = 0.02            # largest step inside a trajectory [m]; ten times this for the velocity [m/s]
 
@@ -57,8 +57,8 @@ def check_order(order: TrajectoryOrder, vehicle: Vehicle) -> None:
         TrajectoryRefused: with the value and its limit.
     """
     trajectory, duration = order.trajectory, order.trajectory.duration
-    if said := limits.problem(order):
-        raise TrajectoryRefused(said)
+    if problem := limits.problem(order):
+        raise TrajectoryRefused(problem)
     if not order.recovery_start <= duration + 1e-6:
         raise TrajectoryRefused(f"recovery_start {order.recovery_start} s is not within the trajectory's {duration:.3f} s")
     if isinstance(trajectory, FlatTrajectory):
@@ -129,12 +129,12 @@ def check_start(order: Order, now: float, present: Setpoint) -> None:
     Raises:
         TrajectoryRefused: with the gap and its limit.
     """
-    late = now - order.start
-    if late > LATEST:
-        raise TrajectoryRefused(f"starts {late:.2f} s in the past; at most {LATEST:g} s is allowed")
-    if -late > _EARLIEST:
-        raise TrajectoryRefused(f"starts {-late:.2f} s in the future; at most {_EARLIEST:g} s is allowed")
-    begin = order.source.setpoint(max(late, 0.0))
+    delay = now - order.start
+    if delay > START_DELAY_MAX:
+        raise TrajectoryRefused(f"starts {delay:.2f} s in the past; at most {START_DELAY_MAX:g} s is allowed")
+    if -delay > _START_AHEAD_MAX:
+        raise TrajectoryRefused(f"starts {-delay:.2f} s in the future; at most {_START_AHEAD_MAX:g} s is allowed")
+    begin = order.source.setpoint(max(delay, 0.0))
     gap = float(np.linalg.norm(np.subtract(begin.p, present.p)))
     if gap > START_GAP:
         raise TrajectoryRefused(f"starts {gap:.2f} m away from the vehicle; at most {START_GAP:g} m is allowed")

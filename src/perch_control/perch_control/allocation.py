@@ -53,7 +53,7 @@ def _thrust_interval(lo, hi, offset, a, d):
 
 
 @compiled
-def _beyond(n, low, high, levers):
+def _support(n, low, high, levers):
     """Largest component of the attainable tilt moments along a direction `n`. [N m]"""
     total = 0.0
     for i in range(4):
@@ -72,7 +72,7 @@ def _tilt_share(wanted, floor, ceiling, levers):
             n = (-sign * levers[1][i], sign * levers[0][i])
             demand = n[0] * wanted[0] + n[1] * wanted[1]
             if demand > _TINY:
-                share = min(share, _beyond(n, low, high, levers) / demand)
+                share = min(share, _support(n, low, high, levers) / demand)
     return share
 
 
@@ -85,7 +85,7 @@ def _nearest_tilt(wanted, lo, hi, levers):
         along = (levers[0][i] / length, levers[1][i] / length)
         for sign in (1.0, -1.0):
             n = (-sign * along[1], sign * along[0])
-            reach = _beyond(n, lo, hi, levers)
+            reach = _support(n, lo, hi, levers)
             across = n[0] * wanted[0] + n[1] * wanted[1]
             if across > reach + _TINY:
                 inside = False

@@ -59,35 +59,35 @@ class Assembly:
 
     def restart(self) -> None:
         """Begin a new flight, disarmed, with the law in use."""
-        self._begin(self.flown, self.flight.compensator is not None)
+        self._begin(self.active_law, self.flight.compensator is not None)
 
     def _begin(self, law: str, adaptive: bool) -> None:
         self.flight = FlightController(self.vehicle, self.laws[law], self._params.gain_set, self._params.flight)
         self.choose(law, adaptive)
 
     @property
-    def flown(self) -> str:
+    def active_law(self) -> str:
         """Name of the law in use."""
         return next(name for name, law in self.laws.items() if law is self.flight.law)
 
     # -- laws --------------------------------------------------------------------------------------------------------
 
-    def prepare_slow_laws(self, work: Callable[[Job], None], say: Callable[[str], None]) -> None:
+    def prepare_slow_laws(self, work: Callable[[Job], None], log: Callable[[str], None]) -> None:
         """Build the slow laws in the background.
 
         Args:
             work: runs a job in the background.
-            say: logs which law could not be built.
+            log: logs which law could not be built.
         """
         for name in LAWS:
             if name not in self.laws and law_class(name).slow:
-                self._prepare(name, work, say)
+                self._prepare(name, work, log)
 
-    def _prepare(self, name: str, work: Callable[[Job], None], say: Callable[[str], None]) -> None:
+    def _prepare(self, name: str, work: Callable[[Job], None], log: Callable[[str], None]) -> None:
         params = self._params
-        work(Job(build_law, (name, self.vehicle, params), partial(self._prepared, name, params, work, say)))
+        work(Job(build_law, (name, self.vehicle, params), partial(self._prepared, name, params, work, log)))
 
-    def _prepared(self, name: str, params: ControllerParameters, work: Callable[[Job], None], say: Callable[[str], None],
+    def _prepared(self, name: str, params: ControllerParameters, work: Callable[[Job], None], log: Callable[[str], None],
                   built: Law | Exception) -> None:
         law: Law | Exception | None = built
         if params is not self._params:  # gains were changed in the meantime
@@ -96,14 +96,14 @@ class Assembly:
             except ConfigError:
                 law = None
         if law is None:
-            self._prepare(name, work, say)
+            self._prepare(name, work, log)
             return
         if isinstance(law, Exception):
-            self._failed[name] = str(law), partial(self._prepare, name, work, say)
-            say(f"{name} could not be built: {law}")
+            self._failed[name] = str(law), partial(self._prepare, name, work, log)
+            log(f"{name} could not be built: {law}")
             return
         self.laws[name] = law
-        self._show_lines(law)
+        self._update_lines(law)
 
     def choose(self, type: str, adaptive: bool) -> None:
         """Use a law, with or without L1, from the next step on.
@@ -114,7 +114,7 @@ class Assembly:
         """
         if type not in self.laws:
             if law_class(type).slow:
-                raise LawNotReady(self._absent(type))
+                raise LawNotReady(self._not_ready_reason(type))
             self.laws[type] = build_law(type, self.vehicle, self._params)
         flight = self.flight
         if not adaptive:
@@ -130,29 +130,29 @@ class Assembly:
             ConfigError: a parameter that is fixed after the start has changed, or the law is not ready; nothing is changed.
         """
         flight, old = self.flight, self._params
-        choice, flown = params.controller, self.flown
+        choice, active_law = params.controller, self.active_law
         if choice.type != old.controller.type and choice.type not in self.laws and law_class(choice.type).slow:
-            raise ConfigError("", "controller.type", self._absent(choice.type))
+            raise ConfigError("", "controller.type", self._not_ready_reason(choice.type))
         changed = {name: law.retuned(params) for name, law in self.laws.items()}
-        if changed[flown] is None:
-            changed[flown] = build_law(flown, self.vehicle, params)
+        if changed[active_law] is None:
+            changed[active_law] = build_law(active_law, self.vehicle, params)
         self._params = params
         self.laws = {name: law for name, law in changed.items() if law is not None}
         if flight.compensator is not None:
             flight.compensator.bandwidth = choice.l1_bandwidth
         # What the service has chosen stays where the parameter has not changed.
         adaptive = flight.compensator is not None
-        self.choose(choice.type if choice.type != old.controller.type else flown,
+        self.choose(choice.type if choice.type != old.controller.type else active_law,
                     choice.adaptive if choice.adaptive != old.controller.adaptive else adaptive)
         failed, self._failed = self._failed, {}
-        for _, again in failed.values():
-            again()
+        for _, retry in failed.values():
+            retry()
 
-    def _absent(self, name: str) -> str:
+    def _not_ready_reason(self, name: str) -> str:
         """Return why a slow law is not available."""
         return f"{name} could not be built: {self._failed[name][0]}" if name in self._failed else f"{name} is not ready: it is being built"
 
-    # -- what is flown -----------------------------------------------------------------------------------------------
+    # -- references and lines ----------------------------------------------------------------------------------------
 
     def reference(self, trajectory: FlatTrajectory | SampledTrajectory) -> FlatReference | SampledReference:
         """Return a trajectory as a reference for the laws."""
@@ -171,13 +171,13 @@ class Assembly:
         return Order(order.id, self.reference(trajectory), trajectory.start_time, AtEnd(order.at_end), float(order.contact_time),
                      float(order.recovery_start))
 
-    def see(self, segments: Sequence[Segment]) -> None:
+    def set_lines(self, segments: Sequence[Segment]) -> None:
         """Pass the map of powerlines to the laws that use it."""
         self._segments = segments
         for law in self.laws.values():
-            self._show_lines(law)
+            self._update_lines(law)
 
-    def _show_lines(self, law: Law) -> None:
-        belief = self.flight.flown.belief
-        if self._params.nmpc.lines.any and belief:
-            law.lines(chosen_lines(self._segments, np.array(belief[0:3]), self._params.nmpc.lines.watched))
+    def _update_lines(self, law: Law) -> None:
+        state = self.flight.flight_state.state_estimate
+        if self._params.nmpc.lines.any and state:
+            law.lines(chosen_lines(self._segments, np.array(state[0:3]), self._params.nmpc.lines.watched))

@@ -6,12 +6,13 @@ from dataclasses import fields
 from functools import lru_cache
 from typing import Any
 
-from perch_core.component import Component, Diagnostics, Emitter, Input, Output, Service, Wake
+from perch_core.component import Component, Diagnostics, Emitter, Input, Output, Service, Timer
 from perch_core.errors import ConfigError, PerchError
 from perch_core.imu_axes import ImuAxes
 from perch_core.values import (
-    NANOSECONDS, Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, EstimatorHealth, ImuSample,
-    LawChosen, MotorCommand, OdometryState, PowerlineMap, RatesThrust, TrajectoryOrder, Transform, nanoseconds, seconds)
+    NANOSECONDS, AtEnd, AttitudeThrust, ControllerCommand, ControllerStatus, ControlReference, EstimatorHealth, ImuSample, MotorCommand,
+    OdometryState, PowerlineMap, RatesThrust, SetControllerRequest, SetControllerResponse, TrajectoryOrder, Transform, TriggerRequest,
+    TriggerResponse, nanoseconds, seconds)
 from perch_core.values.limits import problem
 from perch_core.vehicle import load_vehicle
 from perch_control.assembly import Assembly, LawNotReady
@@ -24,12 +25,12 @@ from perch_control.stamp_guard import Stamp, StampGuard
 STATUS_PERIOD = 20_000_000        # of controller/status [ns]
 DIAGNOSTICS_PERIOD = NANOSECONDS
 DIAGNOSTICS_PHASE = 666_000_000   # not with the status [ns]
-BLIND_AFTER = 0.08                # without odometry for so long, the IMU is answered; motors stop after 0.1 s without commands [s]
-LONGEST_PLAN = 60.0               # a way out that starts later is none out of what is flown [s]
-STALE = NANOSECONDS               # a command or an estimator's status that is older is of another time [ns]
-GONE = NANOSECONDS                # after so long without any input, a source that begins anew is believed in flight, too [ns]
+BLIND_AFTER = 0.08                # without odometry for so long, IMU samples are answered; motors stop 0.1 s after the last command [s]
+LONGEST_PLAN = 60.0               # a way out that starts later does not belong to the running trajectory [s]
+STALE = NANOSECONDS               # age at which a command or an estimator's status is no longer current [ns]
+INPUTS_LOST_AFTER = NANOSECONDS   # without any input for so long, a restart of time is accepted in flight, too [ns]
 _FIXED = ("vehicle", "sensors")   # parameters that do not change after the start
-_WORDS = 200                      # characters of a reason that are passed on
+_REASON_LENGTH = 200              # characters of a reason that are passed on
 
 
 class Controller(Component[ControllerParameters]):
@@ -58,9 +59,9 @@ class Controller(Component[ControllerParameters]):
     attitude_thrust = Output(AttitudeThrust, "attitude_thrust_command")
     status = Output(ControllerStatus, "controller/status")
     reference = Output(ControlReference, "controller/reference")
-    set_controller = Service(ChooseLaw, LawChosen, "set_controller")
-    abort = Service(Ask, Done, "abort")
-    watchdog = Wake(0.02)
+    set_controller = Service(SetControllerRequest, SetControllerResponse, "set_controller")
+    abort = Service(TriggerRequest, TriggerResponse, "abort")
+    watchdog = Timer(0.02)
 
     def __init__(self, config: ControllerParameters) -> None:
         """
@@ -75,8 +76,8 @@ class Controller(Component[ControllerParameters]):
         self._assembly = Assembly(config, vehicle)
         self._axes = ImuAxes(self.warn, config.sensors)
         self._stamps = StampGuard()
-        self._spoken: int | None = None   # the host's time at which an input was last known to have come [ns]
-        self._spoke, self._gone = False, False
+        self._last_input_time: int | None = None  # the host's time of the last check of the watchdog after an input [ns]
+        self._input_received, self._inputs_lost = False, False
         self._begin()
 
     def _begin(self) -> None:
@@ -85,8 +86,8 @@ class Controller(Component[ControllerParameters]):
         self._answered: int | None = None  # newest stamp when odometry was last answered [ns]
         self._first: int | None = None     # stamp of the first answer [ns]
         self._statuses = self._references = self._diagnoses = self._steps = 0
-        self._due = 0                      # time since then at which something is to be said at the earliest [ns]
-        self._silent = False               # a silence is being answered
+        self._due = 0                      # time since then at which the next periodic output is due [ns]
+        self._silent = False               # whether IMU or watchdog are answered, as odometry is missing
 
     def warm_up(self) -> None:
         """Load the compiled code, and start to build the slow laws in the background."""
@@ -112,56 +113,57 @@ class Controller(Component[ControllerParameters]):
     def on_imu(self, sample: ImuSample) -> None:
         """Pass a sample to the flight controller; answer it with a command where odometry has stopped."""
         taken = self._axes.in_body(sample)
-        if taken is None or not self._believed(sample.stamp, "imu/data_raw"):
+        if taken is None or not self._stamp_accepted(sample.stamp, "imu/data_raw"):
             return
         stamp, answered = sample.stamp, self._answered
         self.flight.imu(seconds(stamp), taken.w_B, taken.f_B)
         if answered is None or stamp <= answered or not (self._silent or stamp - answered >= nanoseconds(BLIND_AFTER)):
             return
         if self.flight.state not in (State.DISARMED, State.FAILED, State.ATTACHED):
-            self._answer_silence(stamp, "odometry has stopped: the IMU is answered")
+            self._answer_silence(stamp, "odometry has stopped: commands follow the IMU samples")
 
     def on_odometry(self, state: OdometryState) -> None:
         """Answer a sample in `map` with a current stamp by a command to the vehicle, even where its values are refused."""
         if state.frame != "map":
-            self.warn(f"odometry: frame {state.frame!r} is not 'map': ignored", every=1.0)
+            self.warn(f"odometry: frame {state.frame!r} is not 'map': ignored", min_interval=1.0)
             return
-        if not self._believed(state.stamp, "odometry"):
+        if not self._stamp_accepted(state.stamp, "odometry"):
             return
         self._answered, self._silent = self._stamps.newest, False
         self._answer(state.stamp, self.flight.step(seconds(state.stamp), (*state.p_WB, *state.v_WB, *state.q_WB, *state.w_B),
                                                    (state.pose_covariance, state.twist_covariance), problem(state)))
 
-    def _believed(self, stamp: int, channel: str) -> bool:
+    def _stamp_accepted(self, stamp: int, channel: str) -> bool:
         """Whether a stamp is accepted. If time has restarted, a new flight begins; if it has jumped, the vehicle descends."""
-        verdict = self._stamps.judge(stamp, may_restart=not self.flight.flown.flying or self._gone)
-        if verdict is Stamp.PRESENT:
-            self._spoke = True
+        verdict = self._stamps.check(stamp, may_restart=not self.flight.flight_state.flying or self._inputs_lost)
+        if verdict is Stamp.CURRENT:
+            self._input_received = True
             return True
         if verdict is Stamp.REFUSED:
             newest = seconds(self._stamps.newest)
-            self.warn(f"{channel}: stamp {seconds(stamp):.3f} s is not of the present ({newest:.3f} s): ignored", every=1.0)
+            self.warn(f"{channel}: stamp {seconds(stamp):.3f} s is not current (newest: {newest:.3f} s): ignored",
+                      min_interval=1.0)
             return False
-        if verdict is Stamp.ANEW:
-            self.warn(f"{channel}: stamps go on from {seconds(stamp):.3f} s: starting anew, disarmed")
+        if verdict is Stamp.RESTARTED:
+            self.warn(f"{channel}: time has restarted at {seconds(stamp):.3f} s: new flight, disarmed")
             self._assembly.restart()
             self._begin()
         else:
-            self.warn(f"{channel}: stamps go on from {seconds(stamp):.3f} s")
+            self.warn(f"{channel}: time has jumped ahead to {seconds(stamp):.3f} s")
             self.flight.descend("time has jumped ahead")
-        self._spoke = True
+        self._input_received = True
         return True
 
     # -- silence -----------------------------------------------------------------------------------------------------
 
     def on_watchdog(self, now: int) -> None:
         """Descend without position where neither odometry nor IMU samples arrive in flight."""
-        if self._spoke or self._spoken is None or now < self._spoken:
-            self._spoke, self._spoken, self._gone = False, now, False
+        if self._input_received or self._last_input_time is None or now < self._last_input_time:
+            self._input_received, self._last_input_time, self._inputs_lost = False, now, False
             return
-        silent = now - self._spoken
-        self._gone = silent >= GONE
-        if self.flight.flown.flying and silent >= nanoseconds(BLIND_AFTER):
+        silent = now - self._last_input_time
+        self._inputs_lost = silent >= INPUTS_LOST_AFTER
+        if self.flight.flight_state.flying and silent >= nanoseconds(BLIND_AFTER):
             self._answer_silence(self._stamps.newest + silent, "neither odometry nor IMU: descending by the clock")
 
     def _answer_silence(self, stamp: int, why: str) -> None:
@@ -177,14 +179,14 @@ class Controller(Component[ControllerParameters]):
         try:
             self.flight.follow(self._assembly.order(order))
         except PerchError as error:
-            self.flight.refused(f"trajectory {order.id} refused: {error}")
-            self.warn(self.flight.flown.message)
+            self.flight.report_refusal(f"trajectory {order.id} refused: {error}")
+            self.warn(self.flight.flight_state.message)
 
     def on_recovery(self, order: TrajectoryOrder) -> None:
         """Keep a way out (a planned recovery) from the trajectory with the same id."""
         try:
             if (start := order.trajectory.start_time) > seconds(self._stamps.newest) + LONGEST_PLAN:
-                raise PerchError(f"it starts at {start:.1f} s, long after what is flown")
+                raise PerchError(f"it starts at {start:.1f} s, long after the running trajectory")
             way_out = order._replace(at_end=AtEnd.HOLD, contact_time=0.0, recovery_start=0.0)
             self.flight.keep_ready(self._assembly.order(way_out))
         except PerchError as error:
@@ -196,50 +198,52 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"command {command.command} of {seconds(command.stamp):.3f} s is too old: ignored")
             return
         try:
-            if command.command == Command.ARM and not self._to_vehicle.wanted:
-                raise CommandRefused("arm is refused: no vehicle takes the commands yet")
-            self.flight.command(Command(command.command), command.reason[:_WORDS])
+            if command.command == Command.ARM and not self._to_vehicle.has_receivers:
+                raise CommandRefused("arm is refused: no vehicle has subscribed to the commands yet")
+            self.flight.command(Command(command.command), command.reason[:_REASON_LENGTH])
         except ValueError as error:  # CommandRefused, or no such command
-            self.flight.refused(str(error))
+            self.flight.report_refusal(str(error))
             self.warn(f"command: {error}")
 
     def on_powerlines(self, lines: PowerlineMap) -> None:
         """Pass the map to the laws that use it. The topic is latched, so an old map is valid; one from the future is ignored."""
         newest = self._stamps.newest
-        if self._stamps.begun and lines.stamp > newest + STALE:
-            self.warn(f"powerlines: of {seconds(lines.stamp):.3f} s, which is to come ({seconds(newest):.3f} s): ignored", every=1.0)
+        if self._stamps.initialised and lines.stamp > newest + STALE:
+            self.warn(f"powerlines: stamp {seconds(lines.stamp):.3f} s is in the future (newest: {seconds(newest):.3f} s): ignored",
+                      min_interval=1.0)
             return
         if not self.config.nmpc.lines.any:
             return
         try:
-            self._assembly.see([line.segment for line in lines.lines])
+            self._assembly.set_lines([line.segment for line in lines.lines])
         except PerchError as error:
-            self.warn(f"powerlines: {error}: ignored", every=1.0)
+            self.warn(f"powerlines: {error}: ignored", min_interval=1.0)
 
     def on_estimator(self, health: EstimatorHealth) -> None:
         """Take the estimator's health; an estimator that has diverged or coasts for too long ends the running manoeuvre."""
         newest = self._stamps.newest
-        if self._stamps.begun and abs(newest - health.stamp) > STALE:
-            self.warn(f"estimator/status: of {seconds(health.stamp):.3f} s, not of the present ({seconds(newest):.3f} s): ignored", every=1.0)
+        if self._stamps.initialised and abs(newest - health.stamp) > STALE:
+            self.warn(f"estimator/status: stamp {seconds(health.stamp):.3f} s is not current (newest: {seconds(newest):.3f} s): ignored",
+                      min_interval=1.0)
             return
-        self.flight.estimator(health.state, float(health.vio_age), health.message[:_WORDS])
+        self.flight.estimator(health.state, float(health.vio_age), health.message[:_REASON_LENGTH])
 
     # -- services ----------------------------------------------------------------------------------------------------
 
-    def on_set_controller(self, request: ChooseLaw, reply) -> None:
+    def on_set_controller(self, request: SetControllerRequest, reply) -> None:
         """Switch to another control law from the next step on."""
         try:
             self._assembly.choose(request.type, request.adaptive)
         except LawNotReady as error:
-            reply(LawChosen(False, 2, str(error)))
+            reply(SetControllerResponse(False, 2, str(error)))
         except ConfigError as error:
-            reply(LawChosen(False, 1, str(error)))
+            reply(SetControllerResponse(False, 1, str(error)))
         else:
-            reply(LawChosen(True, 0, f"{self.flight.law_name} flies"))
+            reply(SetControllerResponse(True, 0, f"{self.flight.law_name} is active"))
 
-    def on_abort(self, request: Ask, reply) -> None:
+    def on_abort(self, request: TriggerRequest, reply) -> None:
         """End the running manoeuvre in a hover."""
-        reply(Done(True, self.flight.abort()))
+        reply(TriggerResponse(True, self.flight.abort()))
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 
@@ -259,9 +263,9 @@ class Controller(Component[ControllerParameters]):
         if self._first is None:
             self._first = now
         if now - self._first >= self._due:
-            self._say(now, now - self._first, stamp, result)
+            self._emit_periodic(now, now - self._first, stamp, result)
 
-    def _say(self, now: int, since: int, stamp: int, result: StepResult) -> None:
+    def _emit_periodic(self, now: int, since: int, stamp: int, result: StepResult) -> None:
         """Emit the periodic outputs that are due; `since`: time since the first answer [ns]."""
         period = nanoseconds(self.config.controller.reference_period)
         if since >= self._statuses * STATUS_PERIOD:
@@ -269,7 +273,7 @@ class Controller(Component[ControllerParameters]):
             self._emit_status(now)
         if since >= self._references * period:
             self._references = since // period + 1
-            if result.setpoint is not None and self.reference.wanted:
+            if result.setpoint is not None and self.reference.has_receivers:
                 self._emit_reference(stamp, result.setpoint, result)
         if since >= self._diagnoses * DIAGNOSTICS_PERIOD + DIAGNOSTICS_PHASE:
             self._diagnoses = (since - DIAGNOSTICS_PHASE) // DIAGNOSTICS_PERIOD + 1
@@ -277,7 +281,7 @@ class Controller(Component[ControllerParameters]):
         self._due = min(self._statuses * STATUS_PERIOD, self._references * period, self._diagnoses * DIAGNOSTICS_PERIOD + DIAGNOSTICS_PHASE)
 
     def _emit_status(self, stamp: int) -> None:
-        flight, x = self.flight, self.flight.flown
+        flight, x = self.flight, self.flight.flight_state
         self.status(ControllerStatus(
             stamp=stamp, state=int(flight.state), controller=flight.law_name, trajectory_id=x.trajectory_id,
             trajectory_time=float(flight.trajectory_time), trajectory_duration=float(x.order.source.duration) if x.order else 0.0,
@@ -286,7 +290,7 @@ class Controller(Component[ControllerParameters]):
 
     def _emit_reference(self, stamp: int, x: Setpoint, result: StepResult) -> None:
         self.reference(ControlReference(
-            stamp, self.flight.flown.trajectory_id, p=x.p, q=result.q_C, v=x.v, a=x.a, w=result.w_C, dw=result.dw_C,
+            stamp, self.flight.flight_state.trajectory_id, p=x.p, q=result.q_C, v=x.v, a=x.a, w=result.w_C, dw=result.dw_C,
             thrust=float(result.wrench[0]), moment=tuple(result.wrench[1:4])))
 
     def _diagnose(self, stamp: int) -> None:
@@ -294,7 +298,7 @@ class Controller(Component[ControllerParameters]):
         values = {"state": flight.state.name, "controller": flight.law_name, "steps": self._steps,
                   "odometry_age_s": float(min(flight.odometry_age, 1e6)), "rotor_ratio": flight.health.ratio}
         level = 2 if flight.state is State.FAILED else 1 if flight.health.weak or flight.state in (State.RECOVERING, State.LANDING) else 0
-        self.diagnostics(Diagnostics(stamp, values, level, flight.flown.message))
+        self.diagnostics(Diagnostics(stamp, values, level, flight.flight_state.message))
 
 
 @lru_cache(maxsize=4)

@@ -17,19 +17,19 @@ from perch_control.geometric.law import moment
 from perch_control.geometric.step import rotors_for
 from perch_control.debounce import Debounce
 
-_SHARE = 0.93       # thrust / weight, so that a measured 1 g means ground
-_SPEED = 0.6        # a faster fall is braked, as far as the velocity is known [m/s]
+_THRUST_SHARE = 0.93  # thrust / weight, so that a measured 1 g means ground
+_FALL_SPEED = 0.6   # a faster fall is braked, as far as the velocity is known [m/s]
 _GAIN = 4.0         # braking per speed ... [1/s]
 _BRAKING = 5.0      # ... and at most so much [m/s^2]
 _IMPACT = 25.0      # specific force upwards that counts as hitting the ground: no thrust of this descent is near [m/s^2]
 _LEVELLING = 0.3    # rate at which the accelerometer corrects the attitude [1/s]
 _REST_TIME = 0.3    # 1 g for so long: on the ground [s]
-_SETTLE_TIME = 0.3  # the change of thrust at the beginning is over [s]
+_SETTLE_TIME = 0.3  # duration of the change of thrust at the beginning [s]
 _MEAN_TIME = 0.1    # of the specific force [s]
 _LEAK = 4.0         # the velocity is forgotten with this time constant [s]
-_BOUNCE = 0.5       # after a touch nothing has to be said for so long [s]
-_TOUCHED_SHARE = 0.4  # thrust / weight after a touch
-_KNOWN_SPEED = 6.0  # faster is no velocity to be believed [m/s]
+_BOUNCE_TIME = 0.5  # after a touch the specific force is not evaluated for so long [s]
+_THRUST_SHARE_TOUCHED = 0.4  # thrust / weight after a touch
+_PLAUSIBLE_SPEED = 6.0  # a greater velocity is not used [m/s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,21 +64,21 @@ class AttitudeByImu:
 class BlindDescent:
     """Controller of the descent; owns the attitude estimate and detects ground contact."""
 
-    def __init__(self, vehicle: Vehicle, gains: ControlGains, q: tuple[float, ...], w: tuple[float, ...], seen: float, now: float,
-                 v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
+    def __init__(self, vehicle: Vehicle, gains: ControlGains, q: tuple[float, ...], w: tuple[float, ...], stamp: float,
+                 now: float, v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
         """
         Args:
             vehicle: model with the thrust observed in flight.
             gains: attitude gains.
             q, w, v: last trusted attitude (xyzw), body rates [rad/s] and velocity in W [m/s]; v is zero where it is not trusted.
-            seen: time of q, w and v [s].
+            stamp: time of q, w and v [s].
             now: time at which the descent begins [s]; earlier samples only update attitude and velocity.
         """
         self._gains, self._constants = gains, packed_vehicle(vehicle)
         self._mass = vehicle.mass
         self.attitude = AttitudeByImu(tuple(q), tuple(w))
-        self.v_W = tuple(v) if norm(v) < _KNOWN_SPEED else (0.0, 0.0, 0.0)
-        self._stamp, self._start = seen, now
+        self.v_W = tuple(v) if norm(v) < _PLAUSIBLE_SPEED else (0.0, 0.0, 0.0)
+        self._stamp, self._start = stamp, now
         self._rest, self._f_B = Debounce(_REST_TIME), (0.0, 0.0, GRAVITY)
         self._touched: float | None = None  # when the ground was hit [s]
         self.landed = False
@@ -92,16 +92,16 @@ class BlindDescent:
         f_W = axpy(accel[0], b1, axpy(accel[1], b2, scale(accel[2], b3)))
         self.v_W = axpy(dt, (f_W[0], f_W[1], f_W[2] - GRAVITY), scale(1.0 - dt / _LEAK, self.v_W))
         # On the ground the accelerometer reads 1 g; in this descent, while it brakes nothing, `_SHARE` of it.
-        middle = 0.5 * (1.0 + _SHARE) * GRAVITY
+        middle = 0.5 * (1.0 + _THRUST_SHARE) * GRAVITY
         # The mean of the vector: vibration is ten times the difference, and would lengthen a mean of lengths.
         self._f_B = axpy(dt / _MEAN_TIME, axpy(-1.0, self._f_B, accel), self._f_B)
         force = norm(self._f_B)
-        begun = stamp - self._start > _SETTLE_TIME
-        calm = norm(self._specific_thrust()) < middle and norm(gyro) < 0.5
-        resting = self._rest.update(begun and calm and middle < force < 1.1 * GRAVITY, stamp)
-        if begun and f_W[2] > _IMPACT:  # a wall pushes sideways, the ground upwards
+        transient_over = stamp - self._start > _SETTLE_TIME
+        quiet = norm(self._specific_thrust()) < middle and norm(gyro) < 0.5
+        resting = self._rest.update(transient_over and quiet and middle < force < 1.1 * GRAVITY, stamp)
+        if transient_over and f_W[2] > _IMPACT:  # a wall pushes sideways, the ground upwards
             self._touched = stamp
-        elif self._touched is not None and stamp - self._touched > _BOUNCE and force < 0.7 * GRAVITY:
+        elif self._touched is not None and stamp - self._touched > _BOUNCE_TIME and force < 0.7 * GRAVITY:
             self._touched = None  # nothing carries the vehicle
         self.landed = self.landed or resting
 
@@ -109,13 +109,13 @@ class BlindDescent:
         """Wanted thrust per mass in W [m/s^2]: horizontal speed and climb are braked, the speed of the fall is bounded."""
         vx, vy, vz = self.v_W
         if self._touched is not None:  # held upright by the rotors until it has come to rest
-            return 0.0, 0.0, _TOUCHED_SHARE * GRAVITY
+            return 0.0, 0.0, _THRUST_SHARE_TOUCHED * GRAVITY
         across = limited((-_GAIN * vx, -_GAIN * vy, 0.0), _BRAKING)
-        fall = min(_GAIN * max(-vz - _SPEED, 0.0), _BRAKING)
+        fall = min(_GAIN * max(-vz - _FALL_SPEED, 0.0), _BRAKING)
         climb = min(_GAIN * max(vz, 0.0), _BRAKING)
-        return across[0], across[1], _SHARE * GRAVITY + fall - climb
+        return across[0], across[1], _THRUST_SHARE * GRAVITY + fall - climb
 
-    def wanted(self) -> tuple[float, float, float, float]:
+    def wrench(self) -> tuple[float, float, float, float]:
         """Wanted collective thrust [N] and moments in B [N m]."""
         q, w = self.attitude.q, self.attitude.w
         b1, b2, b3 = axes_of(q)
@@ -133,4 +133,4 @@ class BlindDescent:
 
     def rotors(self, speed: tuple[float, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Rotor commands [rad/s] and the thrusts that they reach [N], from the present rotor speeds."""
-        return rotors_for(self.wanted(), speed, self._constants, self._gains.lead)
+        return rotors_for(self.wrench(), speed, self._constants, self._gains.lead)

@@ -53,9 +53,9 @@ class _DryRun:
 
     def _expected(self) -> tuple[Vector, Vector]:
         """Expected position [m] and velocity [m/s]; at rest at the origin while not flying."""
-        if not self.flight.flown.flying:
+        if not self.flight.flight_state.flying:
             return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        at = self.flight.flown.expected(self.time)
+        at = self.flight.flight_state.expected(self.time)
         return at.p, at.v
 
 
@@ -67,26 +67,26 @@ def dry_run(vehicle: Vehicle, gains: ControlGains, settings: FlightSettings) -> 
     """
     flight = FlightController(vehicle, GeometricController(vehicle, gains), gains, settings)
     flight.compensator = L1Augmentation(vehicle)
-    run, seen = _DryRun(flight), []
+    run, states = _DryRun(flight), []
     run.step()
     flight.command(Command.ARM)
-    seen.append(flight.state)
+    states.append(flight.state)
     run.rise(1, 0.2, AtEnd.HOLD)
     run.step(round(_RISE / NOMINAL_PERIOD) + 5)
-    seen.append(flight.state)
+    states.append(flight.state)
     run.stay(2, AtEnd.CONTACT)
     run.step()
     run.rise(3, 0.4, AtEnd.CONTACT)
     run.step()
-    seen.append(flight.state)
-    flight.flown = recovered(flight.flown, "dry run")
+    states.append(flight.state)
+    flight.flight_state = recovered(flight.flight_state, "dry run")
     run.step()
-    seen.append(flight.state)
+    states.append(flight.state)
     flight.command(Command.LAND)
     run.step()
-    seen.append(flight.state)
+    states.append(flight.state)
     flight.step_blind(run.time + 0.1)
     for k in range(1, 4):
         flight.imu(run.time + 0.1 + k * NOMINAL_PERIOD, (0.0, 0.0, 0.0), (0.0, 0.0, GRAVITY))
         flight.step_blind(run.time + 0.1 + k * NOMINAL_PERIOD)
-    return seen
+    return states

@@ -13,48 +13,49 @@ from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joint
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
-from perch_control.inner_loop import Later
+from perch_control.inner_loop import DelayedReference
 from perch_control.l1 import L1Augmentation
 from perch_control.law import NO_COMPENSATION, Law
-from perch_control.maneuvers import attached, brought_down, descending, entered, landing, motors_off, recovered, stayed, stopped
+from perch_control.maneuvers import (
+    attached, descending, entered, hover_after_jump, land_on_command, landing, motors_off, recovered, stopped)
 from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
 from perch_control.rotor_health import RotorHealth
 from perch_control.schedule import Schedule
-from perch_control.senses import Senses
+from perch_control.sensor_inputs import SensorInputs
 from perch_control.supervisor import Supervisor, committed
-from perch_control.thrust_belief import ThrustBelief
+from perch_control.thrust_model import ThrustModel
 
-_SPARE_SHARE = 0.01          # weight of a step of 2 ms in the mean margin: 0.2 s
-_NOWHERE = (0.0,) * 6        # position and velocity of a descent that knows neither
-_STILL = (0.0,) * 9 + (1.0, 0.0, 0.0, 0.0)
-_MARGIN_PERCH = 0.15         # a perch is refused where the mean thrust margin in hover is less: one rotor is far weaker
-_IDLE_TIME = 10.0            # armed on the ground without a trajectory for so long: motors off [s]
-_ARM_TILT = 0.7              # cosine of the largest tilt at which the motors are started on the ground
-_ARM_FELT = 0.5 * GRAVITY    # specific force along b3 that is felt there at least [m/s^2]
-_COASTING, _DIVERGED = 2, 3  # perch_msgs/EstimatorStatus
-_COASTING_HOVER = 1.0        # no VIO for so long: hover; the position drifts by centimetres until then [s]
-_COASTING_LAND = 3.0         # the same: descend without position [s]
+_SPARE_SHARE = 0.01             # weight of a step of 2 ms in the mean margin: 0.2 s
+_UNKNOWN_MOTION = (0.0,) * 6    # position and velocity in a descent without position
+_AT_REST = (0.0,) * 9 + (1.0, 0.0, 0.0, 0.0)
+_MARGIN_PERCH = 0.15            # a perch is refused where the mean thrust margin in hover is less: one rotor is far weaker
+_IDLE_TIME = 10.0               # armed on the ground without a trajectory for so long: motors off [s]
+_ARM_TILT = 0.7                 # cosine of the largest tilt at which the motors are started on the ground
+_ARM_FORCE_MIN = 0.5 * GRAVITY  # smallest specific force along b3 there [m/s^2]
+_COASTING, _DIVERGED = 2, 3     # perch_msgs/EstimatorStatus
+_COASTING_HOVER = 1.0           # no VIO for so long: hover; the position drifts by centimetres until then [s]
+_COASTING_LAND = 3.0            # the same: descend without position [s]
 
 
 class FlightController:
     """Takes orders, checks odometry, supervises the flight, and evaluates the control law.
 
     Attributes:
-        flown: state of the flight; each input and each step replaces it.
+        flight_state: state of the flight; each input and each step replaces it.
         law, compensator: control law and L1 augmentation in use; compensator None: without L1.
         gains, settings: gains and limits in use; `use` replaces them.
     """
 
     def __init__(self, vehicle: Vehicle, law: Law, gains: ControlGains, settings: FlightSettings) -> None:
         self.law, self.gains, self.settings = law, gains, settings
-        self.flown = FlightState.disarmed(vehicle)
+        self.flight_state = FlightState.disarmed(vehicle)
         self.supervisor = Supervisor(vehicle, settings)
         self.compensator: L1Augmentation | None = None
         self._schedule = Schedule()
-        self._thrust = ThrustBelief(vehicle)
-        self._senses = Senses()
+        self._thrust = ThrustModel(vehicle)
+        self._inputs = SensorInputs()
         self._period = MeasuredPeriod()
         law.begin()
 
@@ -63,25 +64,25 @@ class FlightController:
         if law is not self.law:
             law.begin()
         self.law, self.gains, self.settings = law, gains, settings
-        law.believe(self.vehicle)
-        law.pace(self._period.value)
+        law.set_vehicle(self.vehicle)
+        law.set_period(self._period.value)
         self.supervisor.settings = settings
         self.supervisor.restart(self.state)
 
     @property
     def state(self) -> State:
         """State of the controller, as published."""
-        return self.flown.mode
+        return self.flight_state.mode
 
     @property
     def vehicle(self) -> Vehicle:
         """The vehicle model in use."""
-        return self.flown.vehicle
+        return self.flight_state.vehicle
 
     @property
     def odometry_age(self) -> float:
         """Age of the last accepted odometry sample [s]."""
-        return self._senses.age
+        return self._inputs.age
 
     @property
     def health(self) -> RotorHealth:
@@ -101,7 +102,7 @@ class FlightController:
     @property
     def trajectory_time(self) -> float:
         """Time since the start of the running trajectory [s], 0 without one."""
-        return self.flown.elapsed if self.flown.order is not None else 0.0
+        return self.flight_state.elapsed if self.flight_state.order is not None else 0.0
 
     # -- orders ------------------------------------------------------------------------------------------------------
 
@@ -111,15 +112,15 @@ class FlightController:
         Raises:
             CommandRefused: the command is not possible in the present state.
         """
-        self.flown = COMMANDS[command](self, self.flown, f": {reason}" if reason else "")
-        if not self.flown.flying and command is not Command.ARM:
-            self._schedule.drop()
+        self.flight_state = COMMANDS[command](self, self.flight_state, f": {reason}" if reason else "")
+        if not self.flight_state.flying and command is not Command.ARM:
+            self._schedule.clear()
 
     def _kill(self, x: FlightState, why: str) -> FlightState:
         return motors_off(x, State.FAILED, f"killed{why}")
 
     def _attach(self, x: FlightState, why: str) -> FlightState:
-        if not x.belief:
+        if not x.state_estimate:
             raise CommandRefused("attached is refused: no usable odometry yet")
         if x.mode is State.FAILED:
             raise CommandRefused(f"attached is refused: {x.message}; disarm first")
@@ -132,14 +133,16 @@ class FlightController:
 
     def _land(self, x: FlightState, why: str) -> FlightState:
         _check_flying(x, "land")
-        way_out = self._schedule.leave(x, f"landing{why}") if x.mode is State.TRACKING else None
-        return brought_down(x, f"landing{why}", self.settings.land_speed) if way_out is None else way_out._replace(lands=True)
+        way_out = self._schedule.leave_by_way_out(x, f"landing{why}") if x.mode is State.TRACKING else None
+        if way_out is None:
+            return land_on_command(x, f"landing{why}", self.settings.land_speed)
+        return way_out._replace(land_requested=True)
 
     def _hover(self, x: FlightState, why: str) -> FlightState:
         _check_flying(x, "hover")
         if x.mode is State.RECOVERING:  # it ends in a hover, and must not be cut short
-            return x._replace(lands=False)
-        return self._left(x._replace(lands=False), f"hover{why}")
+            return x._replace(land_requested=False)
+        return self._end_maneuver(x._replace(land_requested=False), f"hover{why}")
 
     def _arm(self, x: FlightState, why: str) -> FlightState:
         if x.mode is State.ARMED or x.flying:
@@ -147,17 +150,19 @@ class FlightController:
         if x.mode not in (State.DISARMED, State.ATTACHED):
             raise CommandRefused(f"arm is refused: {x.mode.name.lower()}; disarm first")
         if self.odometry_age > self.settings.odometry_timeout:
-            raise CommandRefused("arm is refused: no usable odometry" + (f" ({why})" if (why := self._senses.refused) else ""))
-        if self._senses.imu_age(x.now) > self.settings.odometry_timeout:
+            raise CommandRefused("arm is refused: no usable odometry" + (f" ({why})" if (why := self._inputs.refusal) else ""))
+        if self._inputs.imu_age(x.now) > self.settings.odometry_timeout:
             raise CommandRefused("arm is refused: no usable IMU samples")
-        if x.mode is State.DISARMED and axes_of(x.belief[6:10])[2][2] < _ARM_TILT:
+        if x.mode is State.DISARMED and axes_of(x.state_estimate[6:10])[2][2] < _ARM_TILT:
             raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
-        if x.mode is State.DISARMED and self._thrust.felt < _ARM_FELT:
-            raise CommandRefused(f"arm is refused: the IMU feels {self._thrust.felt:.1f} m/s^2 along b3 at rest: its axes are not what they are said to be")
+        if x.mode is State.DISARMED and self._thrust.measured_specific_thrust < _ARM_FORCE_MIN:
+            force = self._thrust.measured_specific_thrust
+            raise CommandRefused(f"arm is refused: the IMU measures {force:.1f} m/s^2 along b3 at rest: its axes are configured wrongly")
         x = self._thrust.reset(x, self.law, self.compensator)
         if x.mode is State.ATTACHED:
-            return recovered(x, "leaving what carries the vehicle")
-        return entered(x, State.ARMED, "armed")._replace(start=x.now, rotors=x.rotors.turning(x.vehicle.speed_min), ground=x.belief[2])
+            return recovered(x, "leaving the surface or wire")
+        return entered(x, State.ARMED, "armed")._replace(start=x.now, rotors=x.rotors.turning(x.vehicle.speed_min),
+                                                         ground=x.state_estimate[2])
 
     def follow(self, order: Order) -> None:
         """Accept a trajectory; it starts at its stamp and replaces the running one there.
@@ -165,26 +170,26 @@ class FlightController:
         Raises:
             TrajectoryRefused: the trajectory may not be flown.
         """
-        x = self.flown
+        x = self.flight_state
         if self.odometry_age > self.settings.odometry_timeout:
             raise TrajectoryRefused("no usable odometry")
-        if self._schedule.leaving(x) or x.lands:
-            raise TrajectoryRefused("what is flown is about to be left")
+        if self._schedule.leaving(x) or x.land_requested:
+            raise TrajectoryRefused("the running manoeuvre is about to be left")
         if x.mode is State.ATTACHED:
-            x = self.flown = self._thrust.reset(x, self.law, self.compensator)
+            x = self.flight_state = self._thrust.reset(x, self.law, self.compensator)
         elif x.mode not in (State.ARMED, State.TRACKING, State.HOVERING):
             raise TrajectoryRefused(f"the vehicle is {x.mode.name.lower()}, not armed and ready")
-        if not x.takes(order):
-            raise TrajectoryRefused("what was flown is being braked to a hover")
+        if not x.accepts(order):
+            raise TrajectoryRefused("the vehicle is being braked to a hover")
         if x.mode is State.HOVERING and order.at_end is not AtEnd.HOLD and x.spare < _MARGIN_PERCH:
             raise TrajectoryRefused(f"the thrust margin in hover is {x.spare:.2f}; a perch needs {_MARGIN_PERCH:g}")
         check_joints(order.source.trajectory)
         check_start(order, x.now, x.expected(max(order.start, x.now)))
         if order.at_end is AtEnd.CONTACT:
             if x.mode is State.HOVERING:
-                x = self.flown = self._thrust.adopted(x, self.law, self.compensator)
+                x = self.flight_state = self._thrust.adopted(x, self.law, self.compensator)
             self.law.check_contact(order.source)
-        self._schedule.put(order)
+        self._schedule.set_next(order)
 
     def keep_ready(self, order: Order) -> None:
         """Keep a recovery that leaves the trajectory with the same id, for an abort before that recovery's start. [P:V-B]
@@ -192,32 +197,32 @@ class FlightController:
         Raises:
             TrajectoryRefused: the recovery is not continuous.
         """
-        self._schedule.keep_ready(self.flown, order)
+        self._schedule.keep_ready(self.flight_state, order)
 
     def abort(self, reason: str = "abort was requested") -> str:
         """End the running manoeuvre in a hover, by a recovery where the vehicle is tilted. Returns a message on what is done."""
-        x = self.flown
+        x = self.flight_state
         if x.mode in (State.TRACKING, State.HOVERING):
-            self.flown = self._left(x, reason)
+            self.flight_state = self._end_maneuver(x, reason)
         elif x.mode in (State.ARMED, State.ATTACHED):
-            self._schedule.drop()
-            self.flown = x._replace(message=f"{reason}; nothing is flown")
-        return self.flown.message
+            self._schedule.clear()
+            self.flight_state = x._replace(message=f"{reason}; no manoeuvre is running")
+        return self.flight_state.message
 
-    def _left(self, x: FlightState, reason: str) -> FlightState:
+    def _end_maneuver(self, x: FlightState, reason: str) -> FlightState:
         """End the running manoeuvre: by the next planned way out, or at once."""
-        return self._schedule.leave(x, reason) or self._stopped(x, reason)
+        return self._schedule.leave_by_way_out(x, reason) or self._brake_to_hover(x, reason)
 
-    def _stopped(self, x: FlightState, reason: str) -> FlightState:
+    def _brake_to_hover(self, x: FlightState, reason: str) -> FlightState:
         """Discard pending trajectories and brake to a hover, or land where a hover would touch the ground."""
-        self._schedule.drop()
+        self._schedule.clear()
         if x.low:
             return landing(x, f"landing: {reason}", self.settings.land_speed)
         return stopped(x, reason)
 
-    def refused(self, message: str) -> None:
+    def report_refusal(self, message: str) -> None:
         """Publish why an order was refused."""
-        self.flown = self.flown._replace(message=message)
+        self.flight_state = self.flight_state._replace(message=message)
 
     # -- sensors -----------------------------------------------------------------------------------------------------
 
@@ -228,23 +233,23 @@ class FlightController:
         elif state == _COASTING and vio_age > _COASTING_LAND:
             self.descend(f"no VIO for {vio_age:.1f} s")
         elif state == _COASTING and vio_age > _COASTING_HOVER:
-            self.flown = self._given_up(self.flown, f"no VIO for {vio_age:.1f} s")
+            self.flight_state = self._leave_or_brake(self.flight_state, f"no VIO for {vio_age:.1f} s")
 
-    def _given_up(self, x: FlightState, reason: str) -> FlightState:
+    def _leave_or_brake(self, x: FlightState, reason: str) -> FlightState:
         """Leave a trajectory by a planned way out, or brake; continue where even the hardest brake would end in the surface."""
         if x.mode is not State.TRACKING:
             return x
-        return self._schedule.leave(x, reason) or (x if committed(x) else self._stopped(x, f"hover: {reason}"))
+        return self._schedule.leave_by_way_out(x, reason) or (x if committed(x) else self._brake_to_hover(x, f"hover: {reason}"))
 
     def descend(self, message: str, moving: bool = True) -> None:
         """Begin a descent without position; `moving`: whether the last velocity is trusted."""
-        self.flown = self._descending(self.flown, message, moving)
+        self.flight_state = self._descending(self.flight_state, message, moving)
 
     def _descending(self, x: FlightState, message: str, moving: bool = True) -> FlightState:
         if x.blind is not None or not x.flying:
             return x
-        x = descending(x, message, self._thrust.shown(x), self.gains, self._senses.unseen, moving)
-        self._senses.unseen.clear()
+        x = descending(x, message, self._thrust.observed_vehicle(x), self.gains, self._inputs.imu_since_odometry, moving)
+        self._inputs.imu_since_odometry.clear()
         return x
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
@@ -252,11 +257,11 @@ class FlightController:
 
         Its stamp also reveals that odometry with an older stamp is late.
         """
-        self._thrust.felt = accel[2]
-        self.flown = self.supervisor.imu(self.flown, stamp, gyro, accel)
-        if self.flown.blind is not None:
-            self.flown.blind.imu(stamp, gyro, accel)
-        self._senses.imu(stamp, gyro, accel, keep=self.flown.blind is None)
+        self._thrust.measured_specific_thrust = accel[2]
+        self.flight_state = self.supervisor.imu(self.flight_state, stamp, gyro, accel)
+        if self.flight_state.blind is not None:
+            self.flight_state.blind.imu(stamp, gyro, accel)
+        self._inputs.imu(stamp, gyro, accel, keep=self.flight_state.blind is None)
 
     # -- one step ----------------------------------------------------------------------------------------------------
 
@@ -271,53 +276,53 @@ class FlightController:
             problem: why the sample is invalid; empty: all its values are within their limits.
         """
         if self._period.update(stamp):
-            self.law.pace(self._period.value)
-        x, verdict = self._senses.odometry(self.flown, stamp, sample, covariances, problem)
+            self.law.set_period(self._period.value)
+        x, verdict = self._inputs.odometry(self.flight_state, stamp, sample, covariances, problem)
         lost = self.odometry_age > self.settings.odometry_timeout
         if lost or verdict.jumped:
-            self._schedule.drop()
+            self._schedule.clear()
         if x.blind is None and x.flying:
             if lost:
-                x = self._descending(x, self._senses.refused or "no odometry")
+                x = self._descending(x, self._inputs.refusal or "no odometry")
             elif verdict.jumped:
-                x = stayed(x, verdict.reason)
+                x = hover_after_jump(x, verdict.reason)
         if x.blind is None:
             x = self._schedule.activated(x)
             if x.flying:
                 if not x.airborne and not x.at_ground:
                     x = x._replace(airborne=True)
-                felt = self._senses.imu_age(x.now) <= self.settings.odometry_timeout
-                x = self.supervisor.act(self._thrust.judged(x, self.law, self.compensator, felt))
-        return self._answered(x)
+                imu_fresh = self._inputs.imu_age(x.now) <= self.settings.odometry_timeout
+                x = self.supervisor.act(self._thrust.updated(x, self.law, self.compensator, imu_fresh))
+        return self._finish_step(x)
 
     def step_blind(self, stamp: float) -> StepResult:
         """Answer a step without odometry, from the IMU alone; without IMU samples for `DOWN_TIME`, the motors are stopped."""
-        self._schedule.drop()
-        x = self._senses.silence(self.flown, stamp)
-        if x.flying and self._senses.imu_age(stamp) > DOWN_TIME:
+        self._schedule.clear()
+        x = self._inputs.without_odometry(self.flight_state, stamp)
+        if x.flying and self._inputs.imu_age(stamp) > DOWN_TIME:
             x = motors_off(x, State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s")
-        return self._answered(self._descending(x, "no odometry"))
+        return self._finish_step(self._descending(x, "no odometry"))
 
-    def _answered(self, x: FlightState) -> StepResult:
+    def _finish_step(self, x: FlightState) -> StepResult:
         """Return the command that follows from the state, and store the state after it."""
         x, result = self._descent(x, x.blind) if x.blind is not None else self._fly(x) if x.flying else self._idle(x)
-        self.flown = x._replace(events=()) if x.events else x
+        self.flight_state = x._replace(events=()) if x.events else x
         return result
 
     def _fly(self, x: FlightState) -> tuple[FlightState, StepResult]:
-        setpoint = self.supervisor.wanted(x)
+        setpoint = self.supervisor.setpoint(x)
         contact = x.time_to_contact
-        state, delay = x.rotors.ahead(x.belief, x.vehicle), x.rotors.delay
-        reference = Later(x, delay) if delay > 0.0 else x
-        out = self.law.control(state, reference, x.rotors.led, self._compensation(x, contact), max(contact - delay, 0.0))
+        state, delay = x.rotors.ahead(x.state_estimate, x.vehicle), x.rotors.delay
+        reference = DelayedReference(x, delay) if delay > 0.0 else x
+        out = self.law.control(state, reference, x.rotors.at_effect, self._compensation(x, contact), max(contact - delay, 0.0))
         rotors = x.rotors.following(out.rotor_speed, state, x.vehicle, out.w_C)
         top = x.vehicle.thrust_max
         margin, spare = (top - max(out.rotor_thrust)) / top, x.spare
         if x.mode is State.HOVERING:
             spare += _SPARE_SHARE * (self._period.value / NOMINAL_PERIOD) * (margin - spare)
-        x = x.commanded(rotors, margin, spare, dist(setpoint.p, x.belief[0:3]))
+        x = x.commanded(rotors, margin, spare, dist(setpoint.p, x.state_estimate[0:3]))
         if self.supervisor.landed(x, setpoint):
-            return self._idle(motors_off(x, self._lying, "landed, motors off"))
+            return self._idle(motors_off(x, self._state_after_landing, "landed, motors off"))
         return x, StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, margin, "; ".join(x.events), rotors.sent)
 
     def _compensation(self, x: FlightState, contact: float) -> tuple[float, ...]:
@@ -329,18 +334,18 @@ class FlightController:
             return NO_COMPENSATION
         if x.mode in (State.LANDING, State.RECOVERING) or contact <= 0.0 or x.may_touch(0.0):
             return self.compensator.hold()
-        return self.compensator.update(x.belief, x.rotors.speed, x.now)
+        return self.compensator.update(x.state_estimate, x.rotors.speed, x.now)
 
     def _descent(self, x: FlightState, blind: BlindDescent) -> tuple[FlightState, StepResult]:
         if blind.landed:
-            return self._idle(motors_off(x, self._lying, "landed without position, motors off"))
-        speed, thrust = blind.rotors(x.rotors.led.speed)
-        rotors = x.rotors.following(speed, (*_NOWHERE, *blind.attitude.q, *blind.attitude.w), x.vehicle)
+            return self._idle(motors_off(x, self._state_after_landing, "landed without position, motors off"))
+        speed, thrust = blind.rotors(x.rotors.at_effect.speed)
+        rotors = x.rotors.following(speed, (*_UNKNOWN_MOTION, *blind.attitude.q, *blind.attitude.w), x.vehicle)
         x = x.commanded(rotors, (x.vehicle.thrust_max - max(thrust)) / x.vehicle.thrust_max, x.spare, x.position_error)
-        return x, StepResult(True, speed, wrench=blind.wanted(), margin=x.margin, event="; ".join(x.events), loop=rotors.sent)
+        return x, StepResult(True, speed, wrench=blind.wrench(), margin=x.margin, event="; ".join(x.events), loop=rotors.sent)
 
     @property
-    def _lying(self) -> State:
+    def _state_after_landing(self) -> State:
         """State of the controller after a landing: FAILED where the vehicle lies tilted, else DISARMED."""
         return State.FAILED if self.supervisor.tilted else State.DISARMED
 
@@ -349,7 +354,7 @@ class FlightController:
             x = motors_off(x, State.DISARMED, f"disarmed: no trajectory for {_IDLE_TIME:g} s")
         armed = x.mode is State.ARMED
         speed = (x.vehicle.speed_min,) * 4 if armed else (0.0,) * 4
-        rotors = x.rotors.following(speed, x.belief or _STILL, x.vehicle)
+        rotors = x.rotors.following(speed, x.state_estimate or _AT_REST, x.vehicle)
         return (x.commanded(rotors, 1.0, x.spare, 0.0),
                 StepResult(armed, speed, event="; ".join(x.events), loop=rotors.sent))
 

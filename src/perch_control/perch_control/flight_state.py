@@ -10,15 +10,15 @@ from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.admission import AtEnd, Order
 from perch_control.descent import BlindDescent
 from perch_control.guidance import BRAKE_PEAK, Hold
-from perch_control.inner_loop import InnerLoopEstimate, stopped
+from perch_control.inner_loop import InnerLoopEstimate, rotors_at_rest
 from perch_control.modes import FLYING, State
 from perch_control.reference import Setpoint, Source
 from perch_control.rotor_lag import RotorEstimate
 
 _NEAR_CONTACT = 0.35  # an abort so shortly before a contact pushes away from the surface first [s]
-_LOW = 0.25           # what ends nearer to the ground lands: a hover would touch it [m]
-AIRBORNE = 0.1        # so far above where it was armed, the ground no longer carries the vehicle [m]
-_AWAY = 2.0           # radii of the body from the place of a contact at which nothing there holds the vehicle
+_LOW = 0.25           # below this height a manoeuvre ends in a landing, as a hover would touch the ground [m]
+AIRBORNE = 0.1        # so far above the place of arming, the ground no longer carries the vehicle [m]
+_CLEAR = 2.0          # distance from the place of a contact beyond which nothing there holds the vehicle [body radii]
 
 
 class FlightState(NamedTuple):
@@ -30,16 +30,16 @@ class FlightState(NamedTuple):
         source, start: running reference and the time at which it began [s].
         order, trajectory_id: the tracked trajectory, or the planned way out of it while RECOVERING, else None; the id is kept
             until the next trajectory or until the motors stop.
-        meeting: time and position of the planned contact with a surface or a wire [s, m]; None: there is none.
+        planned_contact: time and position of the planned contact with a surface or a wire [s, m]; None: there is none.
         attached_to: normal of the surface that carries the vehicle; None: there is none.
         blind: the running descent without position; None: there is none.
         ground: height at which the vehicle was armed [m]; `airborne`: whether it has been clear of the ground since.
-        lands: whether a landing was commanded or interrupted; a hover then becomes a landing.
-        stops: whether a trajectory was left before its end; no perch begins during the brake.
+        land_requested: whether a landing was commanded or interrupted; a hover then becomes a landing.
+        left_early: whether a trajectory was left before its end; no perch begins during the brake.
         events: events since the last step, for the log.
         now: time of the step [s].
-        belief: state used for control, 13 floats: odometry, or its prediction while odometry is refused.
-        seen: stamp [s] and state of the last accepted odometry sample.
+        state_estimate: state used for control, 13 floats: odometry, or its prediction while odometry is refused.
+        last_odometry: stamp [s] and state of the last accepted odometry sample.
         rotors: estimate of the rotor speeds, or of the inner loop, by the lag model.
         margin: (max - commanded) / max of the most loaded rotor; `spare`: its mean in hover.
         position_error: distance to the reference [m].
@@ -53,18 +53,18 @@ class FlightState(NamedTuple):
     start: float
     order: Order | None
     trajectory_id: int
-    meeting: tuple[float, tuple[float, ...]] | None
+    planned_contact: tuple[float, tuple[float, ...]] | None
     attached_to: tuple[float, ...] | None
     blind: BlindDescent | None
     ground: float
     airborne: bool
-    lands: bool
-    stops: bool
+    land_requested: bool
+    left_early: bool
     events: tuple[str, ...]
     # the last seven change in each step
     now: float
-    belief: tuple[float, ...]
-    seen: tuple[float, tuple[float, ...]]
+    state_estimate: tuple[float, ...]
+    last_odometry: tuple[float, tuple[float, ...]]
     rotors: RotorEstimate | InnerLoopEstimate
     margin: float
     spare: float
@@ -74,12 +74,12 @@ class FlightState(NamedTuple):
     def disarmed(cls, vehicle: Vehicle) -> FlightState:
         """Return the initial state: a disarmed vehicle without any sensor data."""
         return cls(vehicle, False, State.DISARMED, "disarmed", Hold(Setpoint((0.0, 0.0, 0.0))), 0.0, None, 0, None, None, None, -inf, False, False, False, (),
-                   0.0, (), (0.0, ()), stopped(vehicle), 1.0, 1.0, 0.0)
+                   0.0, (), (0.0, ()), rotors_at_rest(vehicle), 1.0, 1.0, 0.0)
 
-    def sensed(self, now: float, belief: tuple[float, ...], seen: tuple[float, tuple[float, ...]],
+    def sensed(self, now: float, state_estimate: tuple[float, ...], last_odometry: tuple[float, tuple[float, ...]],
                rotors: RotorEstimate | InnerLoopEstimate) -> FlightState:
         """As `_replace`, but faster, since it is called in every step."""
-        return FlightState._make(self[:-7] + (now, belief, seen, rotors) + self[-3:])
+        return FlightState._make(self[:-7] + (now, state_estimate, last_odometry, rotors) + self[-3:])
 
     def commanded(self, rotors: RotorEstimate | InnerLoopEstimate, margin: float, spare: float, position_error: float) -> FlightState:
         """As `_replace`, but faster, since it is called in every step."""
@@ -93,19 +93,20 @@ class FlightState(NamedTuple):
     @property
     def at_ground(self) -> bool:
         """Whether the ground may carry the vehicle: it is low, and has not been airborne or is neither tracking nor hovering."""
-        return not (self.airborne and self.mode in (State.TRACKING, State.HOVERING)) and self.belief[2] - self.ground < AIRBORNE
+        clear = self.airborne and self.mode in (State.TRACKING, State.HOVERING)
+        return not clear and self.state_estimate[2] - self.ground < AIRBORNE
 
     @property
     def low(self) -> bool:
         """Whether the vehicle is too close to the height at which it was armed for a hover, above or below it."""
-        return abs(self.belief[2] - self.ground) < _LOW
+        return abs(self.state_estimate[2] - self.ground) < _LOW
 
     @property
     def braking(self) -> bool:
         """Whether the vehicle brakes to a hover from a trajectory that was left before its end."""
-        return self.stops and self.elapsed < self.source.duration
+        return self.left_early and self.elapsed < self.source.duration
 
-    def takes(self, order: Order) -> bool:
+    def accepts(self, order: Order) -> bool:
         """Whether a trajectory may begin: while `braking`, only one that ends in a hover."""
         return not self.braking or order.at_end is AtEnd.HOLD
 
@@ -122,7 +123,7 @@ class FlightState(NamedTuple):
         """Expected setpoint at a time [s]: that of the reference while tracking or hovering, otherwise the present motion."""
         if self.mode in (State.TRACKING, State.HOVERING):
             return self.source.setpoint(time - self.start)
-        return Setpoint(self.belief[0:3], self.belief[3:6])
+        return Setpoint(self.state_estimate[0:3], self.state_estimate[3:6])
 
     @property
     def specific_thrust_max(self) -> float:
@@ -139,9 +140,9 @@ class FlightState(NamedTuple):
     def may_touch(self, before: float) -> bool:
         """Whether a surface or a wire may act on the vehicle: from `before` seconds before the planned contact until the vehicle
         is away from that place; also during the recovery from there, as an abandoned perch may hold after all."""
-        if self.meeting is None or self.now < self.meeting[0] - before:
+        if self.planned_contact is None or self.now < self.planned_contact[0] - before:
             return False
-        return dist(self.meeting[1], self.belief[0:3]) < _AWAY * max(self.vehicle.body_radii)
+        return dist(self.planned_contact[1], self.state_estimate[0:3]) < _CLEAR * max(self.vehicle.body_radii)
 
     @property
     def stopping(self) -> tuple[float, float]:

@@ -15,8 +15,8 @@ from perch_control.reference import Setpoint, Source, Vector, fields, flat_setpo
 from perch_core.jit import compiled
 from perch_core.trajectory import FlatTrajectory
 
-LONG = 0.5   # a takeover takes so long, where there is twice as much time [s]
-SHORT = 0.3  # a takeover shorter than this asks for more than the vehicle can follow: it uses what time there is [s]
+BLEND_TIME = 0.5      # duration of a transition between references, where there is twice as much time [s]
+BLEND_TIME_MIN = 0.3  # a shorter transition demands more than the vehicle can follow: it uses the remaining time [s]
 BRAKE_PEAK = 1.875  # peak of the derivative of the quintic 0 -> 1 step, per its duration
 BRAKE_HARD = 8.0    # largest deceleration of a brake, where the trajectory leads to a surface [m/s^2]
 _BRAKE = 4.0        # the same in the open: leans by 22 deg at most [m/s^2]
@@ -163,13 +163,13 @@ class Blend:
 def blended(old: Setpoint, source: Source, start: float, end: float) -> Source:
     """Return `source` from its time `start` on, reached from the old setpoint without a jump up to the acceleration.
 
-    The transition takes `LONG`, or half of the time to `end` where this is shorter, but at least `SHORT` where so much time is
-    left. A source that continues the old setpoint exactly is returned unchanged."""
+    The transition takes `BLEND_TIME`, or half of the time to `end` where this is shorter, but at least `BLEND_TIME_MIN` where so
+    much time is left. A source that continues the old setpoint exactly is returned unchanged."""
     new = source.setpoint(start)
     p, v, a = (np.subtract(*pair) for pair in zip(old[:3], new[:3]))
     if max(float(np.abs(g).max()) for g in (p, v, a)) < 1e-6:
         return source
     zero = np.zeros(3)
     left = end - start
-    duration = min(LONG, max(0.5 * left, min(left, SHORT), 0.1))
+    duration = min(BLEND_TIME, max(0.5 * left, min(left, BLEND_TIME_MIN), 0.1))
     return Blend(source, start, Polynomial(quintic(p, v, a, zero, zero, zero, duration), duration, (0.0, 0.0, 0.0)))

@@ -28,10 +28,10 @@ from perch_core.vehicle import Vehicle
 if TYPE_CHECKING:
     from perch_control.reference import Following, Setpoint, Source
 
-_LARGEST_TURN = 1.5  # of a commanded attitude from the present one [rad]
+_TURN_MAX = 1.5         # of a commanded attitude from the present one [rad]
 _ZERO = (0.0, 0.0, 0.0)
 _REST = (0.0,) * 4
-_AT_ONCE = 1e-6      # [s]
+_TIME_TOLERANCE = 1e-6  # [s]
 
 
 class LoopCommand(NamedTuple):
@@ -48,7 +48,7 @@ class LoopCommand(NamedTuple):
     q_WB: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
 
 
-class Later(NamedTuple):
+class DelayedReference(NamedTuple):
     """A running reference at the time at which a command sent at present takes effect; see `Following`.
 
     Attributes:
@@ -101,18 +101,18 @@ class InnerLoopEstimate(NamedTuple):
 
     Attributes:
         nominal: the vehicle of the vehicle file.
-        led: rotors at the time at which a command sent at present takes effect, by their lag model and the laws' commands.
+        at_effect: rotors at the time at which a command sent at present takes effect, by their lag model and the laws' commands.
         speed: present rotor speeds [rad/s], 4 floats.
-        coming: (time until then [s], rotor speeds) for the times between the present and that of `led`.
-        thrust: collective thrust of the loop at the time of `led`, by the loop's model and the file's thrust coefficient [N].
+        pending_speeds: (time until then [s], rotor speeds) for the times between the present and that of `at_effect`.
+        thrust: collective thrust of the loop at that time, by the loop's model and the file's thrust coefficient [N].
         period: period of the commands [s].
         sent: the last command.
     """
 
     nominal: Vehicle
-    led: RotorEstimate
+    at_effect: RotorEstimate
     speed: tuple[float, ...] = _REST
-    coming: tuple[tuple[float, tuple[float, ...]], ...] = ()
+    pending_speeds: tuple[tuple[float, tuple[float, ...]], ...] = ()
     thrust: float = 0.0
     period: float = NOMINAL_PERIOD
     sent: LoopCommand = LoopCommand()
@@ -125,14 +125,15 @@ class InnerLoopEstimate(NamedTuple):
     def turning(self, speed: float) -> InnerLoopEstimate:
         """Return the estimate with all rotors at one speed [rad/s]."""
         thrust = 4.0 * self.nominal.thrust_coefficient * speed * speed
-        return InnerLoopEstimate(self.nominal, self.led.turning(speed), (speed,) * 4, (), thrust, self.period)
+        return InnerLoopEstimate(self.nominal, self.at_effect.turning(speed), (speed,) * 4, (), thrust, self.period)
 
     def after(self, duration: float, time_constant: float) -> InnerLoopEstimate:
         """Return the estimate `duration` seconds later."""
-        coming = tuple((left - duration, speed) for left, speed in self.coming)
-        reached = sum(left < _AT_ONCE for left, _ in coming)
-        return self._replace(led=self.led.after(duration, time_constant), speed=coming[reached - 1][1] if reached else self.speed,
-                             coming=coming[reached:], period=duration if duration > 0.0 else self.period)
+        pending_speeds = tuple((left - duration, speed) for left, speed in self.pending_speeds)
+        reached = sum(left < _TIME_TOLERANCE for left, _ in pending_speeds)
+        return self._replace(at_effect=self.at_effect.after(duration, time_constant),
+                             speed=pending_speeds[reached - 1][1] if reached else self.speed,
+                             pending_speeds=pending_speeds[reached:], period=duration if duration > 0.0 else self.period)
 
     def ahead(self, state: tuple[float, ...], vehicle: Vehicle) -> tuple[float, ...]:
         """Predict the state at which a command sent at present takes effect.
@@ -143,7 +144,7 @@ class InnerLoopEstimate(NamedTuple):
         """
         if self.delay <= 0.0:
             return state
-        speeds = [self.speed, *(speed for _, speed in self.coming)]
+        speeds = [self.speed, *(speed for _, speed in self.pending_speeds)]
         f = thrusts(tuple(sum(column) / len(speeds) for column in zip(*speeds)), vehicle.thrust_coefficient)
         constants = packed_vehicle(vehicle)
         return predicted(state, f, (0.0,) * 6, self.delay, constants[0][0], constants[0][1:4], constants[2])
@@ -159,20 +160,22 @@ class InnerLoopEstimate(NamedTuple):
             w_C: feed-forward rates of an attitude loop [rad/s].
         """
         a, tau, nominal = vehicle.actuation, vehicle.motor_time_constant, self.nominal
-        reached = approached(self.led.speed, command, 1.0 if tau <= 0.0 else 1.0 - exp(-self.period / tau))
+        reached = approached(self.at_effect.speed, command, 1.0 if tau <= 0.0 else 1.0 - exp(-self.period / tau))
         share = 1.0 - exp(-self.period / a.thrust_lag)
-        weaker = vehicle.thrust_coefficient / nominal.thrust_coefficient
-        *rates, thrust = loop_command(thrusts(reached, vehicle.thrust_coefficient), state[10:13], weaker * self.thrust, a.rate_lag, share,
-                                      packed_vehicle(vehicle))
-        thrust = min(max(thrust / weaker, 0.0), 4.0 * nominal.thrust_max)
-        asked = tuple(min(max(rate / gain, -a.rate_max), a.rate_max) for rate, gain in zip(rates, a.rate_gain))
-        turn = limited(scale(a.attitude_lag, axpy(-1.0, w_C, asked)), _LARGEST_TURN)
-        sent = LoopCommand(asked if a.type == "rates_and_thrust" else w_C, thrust / nominal.mass / a.thrust_gain, turned(state[6:10], turn))
-        return self._replace(led=self.led.following(command), coming=(*self.coming, (self.delay, self.led.speed)),
+        thrust_ratio = vehicle.thrust_coefficient / nominal.thrust_coefficient
+        *rates, thrust = loop_command(thrusts(reached, vehicle.thrust_coefficient), state[10:13], thrust_ratio * self.thrust,
+                                      a.rate_lag, share, packed_vehicle(vehicle))
+        thrust = min(max(thrust / thrust_ratio, 0.0), 4.0 * nominal.thrust_max)
+        rates_command = tuple(min(max(rate / gain, -a.rate_max), a.rate_max) for rate, gain in zip(rates, a.rate_gain))
+        turn = limited(scale(a.attitude_lag, axpy(-1.0, w_C, rates_command)), _TURN_MAX)
+        sent = LoopCommand(rates_command if a.type == "rates_and_thrust" else w_C, thrust / nominal.mass / a.thrust_gain,
+                           turned(state[6:10], turn))
+        return self._replace(at_effect=self.at_effect.following(command),
+                             pending_speeds=(*self.pending_speeds, (self.delay, self.at_effect.speed)),
                              thrust=self.thrust + share * (thrust - self.thrust), sent=sent)
 
 
-def stopped(vehicle: Vehicle) -> RotorEstimate | InnerLoopEstimate:
+def rotors_at_rest(vehicle: Vehicle) -> RotorEstimate | InnerLoopEstimate:
     """Return the estimate of rotors at rest, behind an inner loop where the vehicle has one."""
-    still = RotorEstimate(_REST, _REST)
-    return still if vehicle.actuation.type == "rotor_speeds" else InnerLoopEstimate(vehicle, still)
+    rotors = RotorEstimate(_REST, _REST)
+    return rotors if vehicle.actuation.type == "rotor_speeds" else InnerLoopEstimate(vehicle, rotors)

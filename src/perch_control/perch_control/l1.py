@@ -83,7 +83,7 @@ class L1Augmentation:
         self.disturbance = _ZERO
         self._last: tuple | None = None
 
-    def believe(self, vehicle: Vehicle, explained: tuple[float, ...] | None = None) -> None:
+    def set_vehicle(self, vehicle: Vehicle, explained: tuple[float, ...] | None = None) -> None:
         """Use another model of the vehicle.
 
         Args:

@@ -74,11 +74,11 @@ class Law(ABC):
     def begin(self) -> None:
         """Take over control: reset the internal state of an earlier use."""
 
-    def believe(self, vehicle: Vehicle) -> None:
+    def set_vehicle(self, vehicle: Vehicle) -> None:
         """Use a vehicle model whose thrust differs from that of the vehicle file."""
         self.vehicle = vehicle
 
-    def pace(self, period: float) -> None:
+    def set_period(self, period: float) -> None:
         """Use another period of the odometry [s] from the next step on."""
         self.period = period
 

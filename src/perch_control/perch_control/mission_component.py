@@ -9,29 +9,30 @@ from itertools import count
 
 import numpy as np
 
-from perch_core.component import Action, Client, Component, Diagnostics, Goal, Input, Output, Service, Unavailable, Wake
+from perch_core.component import Action, Client, Component, Diagnostics, Goal, Input, Output, Service, Unavailable, Timer
 from perch_core.imu_axes import ImuAxes
 from perch_core.values import (
-    NANOSECONDS, Ask, AtEnd, ControllerCommand, ControllerStatus, Done, EstimatorHealth, ImuSample, OdometryState, PerchFeedback, PerchGoal, PerchPlan,
-    PerchPlanRequest, PerchResult, PowerlineMap, PowerlinePlan, PowerlinePlanRequest, TargetPose, TrajectoryOrder, Transform, nanoseconds, seconds)
-from perch_control.mission.asked import Asked, Requests
+    NANOSECONDS, AtEnd, ControllerCommand, ControllerStatus, EstimatorHealth, ImuSample, OdometryState, PerchFeedback, PerchGoal, PerchPlan,
+    PerchPlanRequest, PerchResult, PowerlineMap, PowerlinePlan, PowerlinePlanRequest, TargetPose, TrajectoryOrder, Transform,
+    TriggerRequest, TriggerResponse, nanoseconds, seconds)
 from perch_control.mission.departure import Departure
 from perch_control.mission.goals import goal_of, problem_with
 from perch_control.mission.machine import MissionMachine
 from perch_control.mission.missions import mission_class
 from perch_control.mission.moves import Moves
 from perch_control.mission.parameters import MissionParameters
+from perch_control.mission.pending_requests import PendingRequest, Requests
 from perch_control.mission.requests import flown_order, perch_request, plan_answer, powerline_request
-from perch_control.mission.sightings import Sightings
+from perch_control.mission.targets import Targets
 from perch_control.mission.values import TICK, ControllerState, Inputs, Mode, Outcome, Outputs, PlanQuery, Result, State
 from perch_control.period import MeasuredPeriod
 from perch_control.stamp_guard import Stamp, StampGuard
 
 FEEDBACK_PERIOD = NANOSECONDS // 10  # where nothing changes [ns]
-SILENCE = NANOSECONDS // 2           # without odometry for so long, the host's time goes on in its place [ns]
-STALE = NANOSECONDS                  # of another time [ns]
+ODOMETRY_TIMEOUT = NANOSECONDS // 2  # without odometry for so long, the host's time is used instead [ns]
+STALE = NANOSECONDS                  # age at which a message is no longer current [ns]
 RUNNING = 1                          # perch_msgs/EstimatorStatus
-IMU_MOST = 4000                      # samples between two ticks that are kept
+IMU_SAMPLES_MAX = 4000               # samples between two ticks that are kept
 _ENDINGS = {Result.PERCHED: "succeeded", Result.CANCELLED: "cancelled"}
 
 
@@ -52,16 +53,16 @@ class _Running:
     machine: MissionMachine
     started: bool = False
     waiting_since: int | None = None
-    pending: Asked | None = None
-    way_out: Asked | None = None
+    pending: PendingRequest | None = None
+    way_out: PendingRequest | None = None
 
 
 class _Departing:
     """A departure with the interface of a goal; its end answers the service request."""
 
-    value, cancel_requested = PerchGoal(mode=Mode.POWERLINE), False  # the planner that is asked is that of wires
+    value, cancel_requested = PerchGoal(mode=Mode.POWERLINE), False  # requests go to the planner for wires
 
-    def __init__(self, reply: Callable[[Done], None]) -> None:
+    def __init__(self, reply: Callable[[TriggerResponse], None]) -> None:
         self._reply = reply
 
     def feedback(self, value: PerchFeedback) -> None:
@@ -69,7 +70,7 @@ class _Departing:
 
     def finish(self, ending: str, result: PerchResult) -> None:
         """Answer the request."""
-        self._reply(Done(result.success, result.message))
+        self._reply(TriggerResponse(result.success, result.message))
 
 
 class Mission(Component[MissionParameters]):
@@ -92,8 +93,8 @@ class Mission(Component[MissionParameters]):
     plan_way_out = Client(PerchPlanRequest, PerchPlan, "plan_way_out")
     plan_powerline = Client(PowerlinePlanRequest, PowerlinePlan, "plan_powerline")
     perch = Action(PerchGoal, PerchFeedback, PerchResult, "perch")
-    depart = Service(Ask, Done, "depart")
-    tick = Wake(TICK)
+    depart = Service(TriggerRequest, TriggerResponse, "depart")
+    tick = Timer(TICK)
 
     def __init__(self, config: MissionParameters) -> None:
         """
@@ -102,22 +103,22 @@ class Mission(Component[MissionParameters]):
         """
         super().__init__(config)
         self._axes = ImuAxes(self.warn, config.sensors)
-        self._ids = count(1)  # the controller tells trajectories apart by them: they go on from goal to goal
+        self._ids = count(1)  # the controller distinguishes trajectories by them: they are unique across goals
         self._running: _Running | None = None
         self._begin()
 
     def _begin(self) -> None:
         """Reset all inputs, moves and requests."""
         self._stamps, self._imu_period = StampGuard(), MeasuredPeriod()
-        self._moves = Moves(self.config.mission)  # home stays from goal to goal
-        self._forces: deque[tuple[float, ...]] = deque(maxlen=IMU_MOST)
+        self._moves = Moves(self.config.mission)  # `home` is kept from goal to goal
+        self._forces: deque[tuple[float, ...]] = deque(maxlen=IMU_SAMPLES_MAX)
         self._odometry: OdometryState | None = None
-        self._seen = Sightings()
+        self._targets = Targets()
         self._status: ControllerStatus | None = None
         self._estimator: EstimatorHealth | None = None
-        self._asked = {channel: Requests() for channel in ("plan_perch", "plan_way_out", "plan_powerline")}
-        self._used = self._heard = -1          # odometry of the last tick, and the host's time then [ns]
-        self._told = (-FEEDBACK_PERIOD, "", "")  # the last feedback: stamp [ns], phase, message
+        self._requests = {channel: Requests() for channel in ("plan_perch", "plan_way_out", "plan_powerline")}
+        self._last_odometry_stamp = self._last_odometry_time = -1  # odometry of the last tick, and the host's time then [ns]
+        self._last_feedback = (-FEEDBACK_PERIOD, "", "")  # the last feedback: stamp [ns], phase, message
         self._diagnosed: int | None = None
 
     def reconfigure(self, config: MissionParameters) -> None:
@@ -135,40 +136,41 @@ class Mission(Component[MissionParameters]):
     def on_imu(self, sample: ImuSample) -> None:
         """Keep the specific force for the next tick."""
         taken = self._axes.in_body(sample)
-        if taken is not None and self._believed(sample.stamp, "imu/data_raw"):
+        if taken is not None and self._stamp_accepted(sample.stamp, "imu/data_raw"):
             self._imu_period.update(seconds(sample.stamp))
             self._forces.append(taken.f_B)
 
     def on_odometry(self, state: OdometryState) -> None:
         """Keep the newest odometry."""
         if state.frame != "map":
-            self.warn(f"odometry: frame {state.frame!r} is not 'map': ignored", every=1.0)
-        elif self._believed(state.stamp, "odometry") and (self._odometry is None or state.stamp > self._odometry.stamp):
+            self.warn(f"odometry: frame {state.frame!r} is not 'map': ignored", min_interval=1.0)
+        elif self._stamp_accepted(state.stamp, "odometry") and (self._odometry is None or state.stamp > self._odometry.stamp):
             self._odometry = state
 
-    def _believed(self, stamp: int, channel: str) -> bool:
-        verdict = self._stamps.judge(stamp)
+    def _stamp_accepted(self, stamp: int, channel: str) -> bool:
+        verdict = self._stamps.check(stamp)
         if verdict is Stamp.REFUSED:
             newest = seconds(self._stamps.newest)
-            self.warn(f"{channel}: stamp {seconds(stamp):.3f} s is not of the present ({newest:.3f} s): ignored", every=1.0)
+            self.warn(f"{channel}: stamp {seconds(stamp):.3f} s is not current (newest: {newest:.3f} s): ignored",
+                      min_interval=1.0)
             return False
-        if verdict is Stamp.ANEW:
-            self.warn(f"{channel}: stamps go on from {seconds(stamp):.3f} s: starting anew")
+        if verdict is Stamp.RESTARTED:
+            self.warn(f"{channel}: time has restarted at {seconds(stamp):.3f} s")
             if self._running is not None:
-                self._finish(self._running, stamp, Outcome(Result.TRACKING_LOST, "time has begun anew"))
+                self._finish(self._running, stamp, Outcome(Result.TRACKING_LOST, "time has restarted"))
             self._begin()
-            self._stamps.judge(stamp)
+            self._stamps.check(stamp)
         return True
 
     def on_target(self, pose: TargetPose) -> None:
         """Keep the newest pose of the pad."""
-        if problem := self._seen.take_pad(pose, self._odometry, self._stamps.newest):
-            self.warn(f"target/pose refused: {problem}", every=1.0)
+        if problem := self._targets.take_pad(pose, self._odometry, self._stamps.newest):
+            self.warn(f"target/pose refused: {problem}", min_interval=1.0)
 
     def on_powerlines(self, lines: PowerlineMap) -> None:
         """Keep the newest map."""
-        if problem := self._seen.take_lines(lines, self._stamps.newest if self._stamps.begun else None):
-            self.warn(f"powerlines refused: {problem}", every=1.0)
+        if problem := self._targets.take_lines(lines, self._stamps.newest if self._stamps.initialised else None):
+            self.warn(f"powerlines refused: {problem}", min_interval=1.0)
 
     def on_status(self, status: ControllerStatus) -> None:
         """Keep the controller's state."""
@@ -180,28 +182,30 @@ class Mission(Component[MissionParameters]):
         if not self._outdated(health, self._estimator, "estimator/status"):
             self._estimator = health
 
-    def _outdated(self, state: ControllerStatus | EstimatorHealth, kept: ControllerStatus | EstimatorHealth | None, channel: str) -> bool:
-        """Whether a message is older than the kept one, or more than `STALE` behind the sensors. It may be ahead of the sensors,
-        as it is published without them, too. A kept message that is ahead by more than `STALE` does not count."""
-        overtaken = kept is not None and 0 < kept.stamp - state.stamp <= STALE
+    def _outdated(self, state: ControllerStatus | EstimatorHealth, previous: ControllerStatus | EstimatorHealth | None,
+                  channel: str) -> bool:
+        """Whether a message is older than the previous one, or more than `STALE` behind the sensors. It may be ahead of the
+        sensors, as it is published without them, too. A previous message that is ahead by more than `STALE` does not count."""
+        overtaken = previous is not None and 0 < previous.stamp - state.stamp <= STALE
         if overtaken or state.stamp < self._stamps.newest - STALE:
-            self.warn(f"{channel}: of {seconds(state.stamp):.3f} s, {'older than the one before' if overtaken else 'not of the present'}: ignored", every=1.0)
+            problem = "older than the one before" if overtaken else "not current"
+            self.warn(f"{channel}: stamp {seconds(state.stamp):.3f} s is {problem}: ignored", min_interval=1.0)
             return True
         return False
 
     # -- ticks -------------------------------------------------------------------------------------------------------
 
     def on_tick(self, now: int) -> None:
-        """Decide where there is newer odometry than at the last tick, or where odometry has been silent for `SILENCE`."""
+        """Decide where there is newer odometry than at the last tick, or none for `ODOMETRY_TIMEOUT`."""
         if self._odometry is None:
             if self._running is not None:
                 self._wait_for_odometry(self._running, now)
             return
         stamp = self._odometry.stamp
-        if stamp != self._used or now < self._heard:
-            self._used, self._heard = stamp, now
-        elif now - self._heard >= SILENCE:
-            stamp += now - self._heard
+        if stamp != self._last_odometry_stamp or now < self._last_odometry_time:
+            self._last_odometry_stamp, self._last_odometry_time = stamp, now
+        elif now - self._last_odometry_time >= ODOMETRY_TIMEOUT:
+            stamp += now - self._last_odometry_time
         else:
             return
         if self._running is not None:
@@ -246,7 +250,8 @@ class Mission(Component[MissionParameters]):
             controller=ControllerState(status.state) if status else ControllerState.DISARMED,
             controller_message=status.message if status else "no controller/status yet",
             trajectory_id=status.trajectory_id if status else 0,
-            target=running.machine.target(self._seen.pad(x), self._seen.lines, state.p_WB), specific_force_B=np.array(self._forces).reshape(-1, 3),
+            target=running.machine.target(self._targets.pad(x), self._targets.lines, state.p_WB),
+            specific_force_B=np.array(self._forces).reshape(-1, 3),
             cancel=running.goal.cancel_requested, imu_period=self._imu_period.value)
 
     def _act(self, running: _Running, stamp: int, outputs: Outputs) -> None:
@@ -259,44 +264,45 @@ class Mission(Component[MissionParameters]):
         if outputs.way_out is not None:
             self.recovery(TrajectoryOrder.of(outputs.trajectory_id, outputs.way_out.trajectory, AtEnd.HOLD))
         if outputs.query is not None:
-            running.pending = self._ask(running, stamp, outputs.query)
+            running.pending = self._request_plan(running, stamp, outputs.query)
         if outputs.way_out_query is not None:
-            running.way_out = self._ask(running, stamp, outputs.way_out_query)
+            running.way_out = self._request_plan(running, stamp, outputs.way_out_query)
         if running.machine.phase.value != "idle":
-            self._tell(running, stamp)
+            self._publish_feedback(running, stamp)
         if outputs.outcome is not None:
             self._finish(running, stamp, outputs.outcome)
 
-    def _tell(self, running: _Running, stamp: int) -> None:
+    def _publish_feedback(self, running: _Running, stamp: int) -> None:
         """Publish the goal's feedback at every change, and every `FEEDBACK_PERIOD`."""
         machine = running.machine
-        words = (machine.phase.value, machine.message)
-        if words == self._told[1:] and stamp - self._told[0] < FEEDBACK_PERIOD:
+        content = (machine.phase.value, machine.message)
+        if content == self._last_feedback[1:] and stamp - self._last_feedback[0] < FEEDBACK_PERIOD:
             return
-        self._told = (stamp, *words)
+        self._last_feedback = (stamp, *content)
         running.goal.feedback(PerchFeedback(machine.phase.value, machine.phase.progress, float(machine.time_to_contact), machine.message))
 
     # -- planners ----------------------------------------------------------------------------------------------------
 
-    def _ask(self, running: _Running, stamp: int, query: PlanQuery) -> Asked:
+    def _request_plan(self, running: _Running, stamp: int, query: PlanQuery) -> PendingRequest:
         surface = running.goal.value.mode == Mode.SURFACE
         channel = "plan_powerline" if not surface else "plan_way_out" if query.recovery else "plan_perch"
-        asked = self._asked[channel].add(Asked(stamp, stamp + nanoseconds(query.latency), seconds(nanoseconds(query.start_time))))
+        start = seconds(nanoseconds(query.start_time))
+        request = self._requests[channel].add(PendingRequest(stamp, stamp + nanoseconds(query.latency), start))
         ratio = self._status.thrust_ratio if self._status is not None else 0.0
-        getattr(self, channel)(perch_request(query, ratio) if surface else powerline_request(query), asked.due)
-        return asked
+        getattr(self, channel)(perch_request(query, ratio) if surface else powerline_request(query), request.due)
+        return request
 
     def on_plan_perch(self, plan: PerchPlan | Unavailable) -> None:
         """Keep the answer until it is due."""
-        self._asked["plan_perch"].answered(plan)
+        self._requests["plan_perch"].answered(plan)
 
     def on_plan_way_out(self, plan: PerchPlan | Unavailable) -> None:
         """Keep the answer until it is due."""
-        self._asked["plan_way_out"].answered(plan)
+        self._requests["plan_way_out"].answered(plan)
 
     def on_plan_powerline(self, plan: PowerlinePlan | Unavailable) -> None:
         """Keep the answer until it is due."""
-        self._asked["plan_powerline"].answered(plan)
+        self._requests["plan_powerline"].answered(plan)
 
     # -- goals -------------------------------------------------------------------------------------------------------
 
@@ -313,10 +319,10 @@ class Mission(Component[MissionParameters]):
         self._take(goal, mission_class(goal.value.mode))
         return ""
 
-    def on_depart(self, request: Ask, reply: Callable[[Done], None]) -> None:
+    def on_depart(self, request: TriggerRequest, reply: Callable[[TriggerResponse], None]) -> None:
         """Leave the surface or wire that carries the vehicle; answered once the vehicle hovers, or the departure has failed."""
         if self._running is not None:
-            reply(Done(False, "a goal is being flown"))
+            reply(TriggerResponse(False, "a goal is being flown"))
         else:
             self._take(_Departing(reply), Departure)
 

@@ -12,14 +12,14 @@ from perch_control.reference import Setpoint
 
 TILT_MARGIN = 45.0  # tilt away from the reference's thrust direction that nothing planned explains [deg]
 _RATE_FACTOR = 1.6  # the same for the body rate, over the vehicle's body_rate_max
-_FAULT_TIME = 0.12  # tilt, rate or position are out for so long before the supervisor acts [s]
-_MARGIN_LEAST = 0.02  # thrust margin that counts as none ...
-_MARGIN_TIME = 1.0  # ... for so long: the rotors are at their limit; a turn is shorter [s]
+_FAULT_TIME = 0.12  # tilt, rate or position deviate for so long before the supervisor acts [s]
+_MARGIN_MIN = 0.02  # thrust margin below which the rotors are at their limit ...
+_MARGIN_TIME = 1.0  # ... for so long: a turn is shorter [s]
 DOWN_TIME = 1.0     # at rest and tilted for so long: something else carries the vehicle [s]
-_MEAN_TIME = 0.05  # of what the IMU says [s]
-_BALANCED = 0.15   # share of gravity by which the specific force of what is carried may be off it
-_TILTED = 0.5      # cosine of the tilt beyond which nothing hovers
-_QUIET = 0.5       # rates of what is carried [rad/s]
+_MEAN_TIME = 0.05   # time constant of the mean of the IMU samples [s]
+_BALANCED = 0.15    # tolerance of the specific force of a carried vehicle around gravity, as a share of it
+_TILTED = 0.5       # cosine of the tilt beyond which no vehicle hovers
+_QUIET = 0.5        # largest body rate of a carried vehicle [rad/s]
 
 
 def reference_tilt_deg(state: tuple[float, ...], setpoint: Setpoint) -> float:
@@ -66,7 +66,7 @@ class TrackingMonitor:
 
     def exhausted(self, margin: float, now: float) -> bool:
         """Whether the rotors have been at their limit for too long."""
-        return self._margin.update(margin < _MARGIN_LEAST, now)
+        return self._margin.update(margin < _MARGIN_MIN, now)
 
     def outside(self, p: tuple[float, ...]) -> float:
         """Distance by which a position is outside the geofence [m], 0 inside."""
@@ -75,7 +75,7 @@ class TrackingMonitor:
         return max(0.0, a - x, x - d, b - y, y - e, c - z, z - f)
 
 
-class CarriedTilted:
+class TiltedContactMonitor:
     """Detects from the IMU alone that something other than the rotors carries the vehicle, at a tilt at which it cannot hover.
 
     The rotors act on the specific force along b3. Where its magnitude is that of gravity for a long time and it does not point
@@ -84,26 +84,26 @@ class CarriedTilted:
 
     Attributes:
         tilted: whether the specific force does not point along b3.
-        lasts: whether the vehicle has been carried like this for `DOWN_TIME`.
+        confirmed: whether the vehicle has been carried like this for `DOWN_TIME`.
     """
 
     def __init__(self) -> None:
         self._held = Debounce(DOWN_TIME)
         self._force, self._rate, self._stamp = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
-        self.tilted = self.lasts = False
+        self.tilted = self.confirmed = False
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take an IMU sample: time [s], angular velocity [rad/s] and specific force [m/s^2] in B."""
         share = min(max(stamp - self._stamp, 0.0) / _MEAN_TIME, 1.0)
         self._stamp = stamp
-        self._force, self._rate = _nearer(self._force, accel, share), _nearer(self._rate, gyro, share)
+        self._force, self._rate = _interpolated(self._force, accel, share), _interpolated(self._rate, gyro, share)
         length = hypot(*self._force)
         self.tilted = self._force[2] < _TILTED * length
         carried = self.tilted and abs(length - GRAVITY) < _BALANCED * GRAVITY and hypot(*self._rate) < _QUIET
-        self.lasts = self._held.update(carried, stamp)
+        self.confirmed = self._held.update(carried, stamp)
 
 
-def _nearer(a: tuple[float, ...], b: tuple[float, ...], share: float) -> tuple[float, float, float]:
+def _interpolated(a: tuple[float, ...], b: tuple[float, ...], share: float) -> tuple[float, float, float]:
     """Return the point at a fraction of the way from one vector to another."""
     x, y, z = a
     return x + share * (b[0] - x), y + share * (b[1] - y), z + share * (b[2] - z)

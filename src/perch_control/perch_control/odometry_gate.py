@@ -14,7 +14,7 @@ from perch_core.jit import compiled
 _POSITION_JUMP = 0.25  # largest step between two samples beyond the motion: above a correction of VIO [m]
 _VELOCITY_JUMP = 1.5   # the same of the velocity, beyond what 4 g change in between [m/s]
 _ATTITUDE_JUMP = 20.0  # the same of the attitude beyond the rotation [deg]
-_CONFIRM = 0.03        # a jump that stays so long, and is as certain as what was before it to within these steps, is the new truth [s]
+_CONFIRM = 0.03        # a jump that lasts so long is accepted, if the uncertainty has grown by less than these limits [s]
 
 
 class Verdict(NamedTuple):
@@ -47,15 +47,15 @@ class OdometryGate:
             return self._accept(stamp, state, covariances)
         if stamp <= self.stamp:
             return Verdict(False, reason=f"odometry stamp {stamp:.3f} s is not after {self.stamp:.3f} s")
-        problem = self._step(self.stamp, self.state, stamp, state)
+        problem = self._jump_reason(self.stamp, self.state, stamp, state)
         if not problem:
             return self._accept(stamp, state, covariances)
-        if self._candidate is None or self._step(self._candidate[1], self._candidate[2], stamp, state):
+        if self._candidate is None or self._jump_reason(self._candidate[1], self._candidate[2], stamp, state):
             self._candidate = (stamp, stamp, state)
         self._candidate = (self._candidate[0], stamp, state)
         if stamp - self._candidate[0] >= _CONFIRM:
-            if doubt := self._doubt(covariances):
-                return Verdict(False, reason=f"{problem}, {doubt}")
+            if uncertain := self._uncertain_part(covariances):
+                return Verdict(False, reason=f"{problem}, {uncertain}")
             return self._accept(stamp, state, covariances, problem)
         return Verdict(False, reason=problem)
 
@@ -63,7 +63,7 @@ class OdometryGate:
         self.stamp, self.state, self._covariances, self._candidate = stamp, state, covariances, None
         return Verdict(True, bool(jump), jump)
 
-    def _doubt(self, covariances: tuple[np.ndarray, np.ndarray] | None) -> str:
+    def _uncertain_part(self, covariances: tuple[np.ndarray, np.ndarray] | None) -> str:
         """Return which part of the state is too uncertain after a jump for the jump to be accepted; empty: none.
 
         Only the covariance added since the last accepted sample counts, as that of VIO grows without bound. Where its 1 sigma
@@ -81,7 +81,7 @@ class OdometryGate:
                 return f"and its {name} is less certain by {sigma:.2g} {unit}"
         return ""
 
-    def _step(self, t0: float, a: tuple[float, ...], t1: float, b: tuple[float, ...]) -> str:
+    def _jump_reason(self, t0: float, a: tuple[float, ...], t1: float, b: tuple[float, ...]) -> str:
         """Return why the step from one sample to another is a jump; empty: it is none."""
         dt = t1 - t0
         dp, dv, turn, spun = _changes(a, b, dt)

@@ -21,7 +21,7 @@ class ControllerChoice:
 
     type: str = text("geometric", doc="control law, one of perch_control.laws (geometric, nmpc); service set_controller changes it, too")
     adaptive: bool = quantity(True, doc="L1 augmentation on force and moment")
-    l1_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=100.0, doc="of what the augmentation makes up for, force and moment")
+    l1_bandwidth: float = quantity(15.0, unit="rad/s", above=0.0, high=100.0, doc="bandwidth of the L1 compensation, force and moment")
     reference_period: float = quantity(0.01, unit="s", above=0.0, high=1.0, doc="of controller/reference")
 
     def __post_init__(self) -> None:

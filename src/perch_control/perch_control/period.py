@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-NOMINAL_PERIOD = 0.002  # of odometry and IMU, until they show another [s]
+NOMINAL_PERIOD = 0.002  # of odometry and IMU, until another one is measured [s]
 _SAMPLES = 25           # differences of which the median is taken
-_SAME = 0.1             # a median that differs by less is the same period
-_SHORTEST, _LONGEST = 0.0005, 0.05
+_TOLERANCE = 0.1        # a median that differs by less is the same period
+_PERIOD_MIN, _PERIOD_MAX = 0.0005, 0.05
 
 
 class MeasuredPeriod:
@@ -30,7 +30,7 @@ class MeasuredPeriod:
             return False
         median = sorted(self._differences)[_SAMPLES // 2]
         self._differences.clear()
-        if abs(median - self.value) <= _SAME * self.value or not _SHORTEST <= median <= _LONGEST:
+        if abs(median - self.value) <= _TOLERANCE * self.value or not _PERIOD_MIN <= median <= _PERIOD_MAX:
             return False
         self.value = median
         return True

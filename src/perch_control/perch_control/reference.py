@@ -171,12 +171,12 @@ class FlatReference:
 
 def with_unit_quaternions(trajectory: SampledTrajectory) -> SampledTrajectory:
     """Return the trajectory with unit quaternions; one that is normalised already is returned unchanged, bit by bit."""
-    off = np.abs(np.linalg.norm(trajectory.q, axis=1) - 1.0).max()
-    return trajectory if off < 1e-9 else trajectory.normalised()
+    norm_error = np.abs(np.linalg.norm(trajectory.q, axis=1) - 1.0).max()
+    return trajectory if norm_error < 1e-9 else trajectory.normalised()
 
 
 @compiled
-def _place(at, t):
+def _sample_index(at, t):
     """Return the index k of the last sample before a time, and the fraction of the interval to the next one."""
     k = min(max(np.searchsorted(at, t, side="right") - 1, 0), len(at) - 2)
     return k, min(max((t - at[k]) / (at[k + 1] - at[k]), 0.0), 1.0)
@@ -190,7 +190,7 @@ def _between(values, k, u):
 
 @compiled
 def _specific_at(at, specific, t):
-    k, u = _place(at, t)
+    k, u = _sample_index(at, t)
     return (1.0 - u) * specific[k] + u * specific[k + 1]
 
 
@@ -212,7 +212,7 @@ def _sampled_setpoints(at, p, v, q, w, dw, specific, times, out):
     for m in range(len(times)):
         t = times[m]
         over = max(t - end, 0.0)
-        k, u = _place(at, t)
+        k, u = _sample_index(at, t)
         f, rate, turning, acceleration = _specific_at(at, specific, t), 0.0, _ZERO, _ZERO
         if over == 0.0:
             turning, acceleration = _between(w, k, u), _between(dw, k, u)
@@ -226,8 +226,8 @@ def _sampled_setpoints(at, p, v, q, w, dw, specific, times, out):
         ddb3 = _in_world(b1, b2, b3, axpy(1.0, cross(turning, e3), cross(acceleration, (0.0, 0.0, 1.0))))
         a = axpy(f, b3, (0.0, 0.0, -GRAVITY))
         velocity = _between(v, k, u)
-        place = axpy(over, axpy(0.5 * over, a, velocity), _between(p, k, u))
-        parts = (place, axpy(over, a, velocity), a, axpy(rate, b3, scale(f, db3)), axpy(2.0 * rate, db3, scale(f, ddb3)),
+        position = axpy(over, axpy(0.5 * over, a, velocity), _between(p, k, u))
+        parts = (position, axpy(over, a, velocity), a, axpy(rate, b3, scale(f, db3)), axpy(2.0 * rate, db3, scale(f, ddb3)),
                  b2, dh, ddh, b3, db3, ddb3)
         for n in range(11):
             for i in range(3):

@@ -102,7 +102,7 @@ class RotorEstimate(NamedTuple):
         return state
 
     @property
-    def led(self) -> RotorEstimate:
+    def at_effect(self) -> RotorEstimate:
         """Return the rotors at which a command sent at present takes effect: the present ones, as there is no delay."""
         return self
 

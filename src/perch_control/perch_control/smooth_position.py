@@ -2,7 +2,7 @@
 
 VIO corrects its position by centimetres per image while the vehicle turns over. Neither the vehicle nor the last estimate of
 the wire moves by that: a controller that followed the corrections would miss the wire by as much, and turn away from it to do
-so. From `BEFORE` the contact on, when the mission stops shifting its plan with the map, the velocity is integrated from the
+so. From `START_BEFORE_CONTACT` on, when the mission stops shifting its plan with the map, the velocity is integrated from the
 last position.
 """
 
@@ -11,9 +11,9 @@ from __future__ import annotations
 from perch_control.admission import AtEnd, Order
 from perch_core.vector3 import axpy, norm
 
-BEFORE = 0.15     # begins so long before the contact; until then a mission moves its plan with the map [s]
-AFTER = 0.25      # and corrections so long after it still are left out [s]
-FARTHEST = 0.15   # odometry that is corrected by more was wrong altogether [m]
+START_BEFORE_CONTACT = 0.15  # corrections are left out from so long before the contact, as the plan is not moved any more ... [s]
+END_AFTER_CONTACT = 0.25     # ... until so long after it [s]
+CORRECTION_MAX = 0.15        # odometry that is corrected by more was wrong altogether [m]
 _ZERO = (0.0, 0.0, 0.0)
 
 
@@ -23,9 +23,9 @@ class SmoothPosition:
     def __init__(self) -> None:
         self._order: Order | None = None
         self._last: tuple[float, tuple[float, ...]] = (0.0, ())
-        self._left_out = _ZERO
+        self._suppressed_correction = _ZERO
 
-    def of(self, time: float, sample: tuple[float, ...], order: Order | None) -> tuple[float, ...]:
+    def state(self, time: float, sample: tuple[float, ...], order: Order | None) -> tuple[float, ...]:
         """Return the state used for control.
 
         Args:
@@ -39,11 +39,11 @@ class SmoothPosition:
             return sample
         since = time - order.start - order.recovery_start
         if self._order is None or self._order.id != order.id:
-            self._order, self._left_out = order, _ZERO
-        elif -BEFORE < since < AFTER:
+            self._order, self._suppressed_correction = order, _ZERO
+        elif -START_BEFORE_CONTACT < since < END_AFTER_CONTACT:
             dt = time - before
             moved = axpy(0.5 * dt, axpy(1.0, last[3:6], sample[3:6]), last[0:3])
-            self._left_out = axpy(1.0, self._left_out, axpy(-1.0, moved, sample[0:3]))
-            if norm(self._left_out) > FARTHEST:
-                self._left_out = _ZERO
-        return (*axpy(-1.0, self._left_out, sample[0:3]), *sample[3:])
+            self._suppressed_correction = axpy(1.0, self._suppressed_correction, axpy(-1.0, moved, sample[0:3]))
+            if norm(self._suppressed_correction) > CORRECTION_MAX:
+                self._suppressed_correction = _ZERO
+        return (*axpy(-1.0, self._suppressed_correction, sample[0:3]), *sample[3:])

@@ -11,12 +11,12 @@ from perch_control.debounce import Debounce
 from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
 from perch_control.guidance import BRAKE_HARD
-from perch_control.maneuvers import landing, landing_weak, motors_off, recovered, settled, stopped
+from perch_control.maneuvers import hover_after_recovery, landing, landing_weak, motors_off, recovered, stopped
 from perch_control.modes import State
-from perch_control.monitors import CarriedTilted, TrackingMonitor
+from perch_control.monitors import TiltedContactMonitor, TrackingMonitor
 from perch_control.recovery import TIMEOUT, Recovery
 from perch_control.reference import ByState, Setpoint, Source, peak_thrust
-from perch_control.rotor_health import HOVER_LEAST, RESERVE
+from perch_control.rotor_health import HOVER_MIN, RESERVE
 from perch_control.weak_landing import WeakLanding
 
 _FENCE_SLACK = 1.0   # so far outside the fence: land, since a hover has not come back [m]
@@ -41,9 +41,9 @@ class Supervisor:
 
     def __init__(self, vehicle: Vehicle, settings: FlightSettings) -> None:
         self.settings, self._rate_max = settings, vehicle.body_rate_max
-        self._carried: CarriedTilted | None = None  # while motors run
-        self._judged: tuple[Source, Vehicle, bool] | None = None  # whether this reference is too much for this vehicle
-        self._wanted: tuple[Source | None, float, Setpoint] = None, 0.0, Setpoint((0.0, 0.0, 0.0))
+        self._tilted_contact: TiltedContactMonitor | None = None  # while motors run
+        self._thrust_check: tuple[Source, Vehicle, bool] | None = None  # whether this reference exceeds this vehicle's thrust
+        self._cached_setpoint: tuple[Source | None, float, Setpoint] = None, 0.0, Setpoint((0.0, 0.0, 0.0))
         self.restart(State.DISARMED)
 
     def restart(self, mode: State) -> None:
@@ -52,63 +52,63 @@ class Supervisor:
         self._monitor = TrackingMonitor(self.settings, self._rate_max)
         self._ground = Debounce(_GROUND_TIME)
 
-    def wanted(self, x: FlightState) -> Setpoint:
+    def setpoint(self, x: FlightState) -> Setpoint:
         """Present setpoint of the running reference; cached, as supervisor and control step use the same one."""
         source, t = x.source, x.now - x.start
-        if self._wanted[0] is not source or self._wanted[1] != t or isinstance(source, ByState):
-            self._wanted = source, t, source.setpoint(t)
-        return self._wanted[2]
+        if self._cached_setpoint[0] is not source or self._cached_setpoint[1] != t or isinstance(source, ByState):
+            self._cached_setpoint = source, t, source.setpoint(t)
+        return self._cached_setpoint[2]
 
     def imu(self, x: FlightState, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> FlightState:
         """Take an IMU sample: time [s], in B [rad/s, m/s^2]. Motors that only press the vehicle onto an obstacle are stopped."""
         if not x.flying:
-            self._carried = None
+            self._tilted_contact = None
             return x
-        if self._carried is None:
-            self._carried = CarriedTilted()
-        self._carried.imu(stamp, gyro, accel)
-        if self._carried.lasts:
+        if self._tilted_contact is None:
+            self._tilted_contact = TiltedContactMonitor()
+        self._tilted_contact.imu(stamp, gyro, accel)
+        if self._tilted_contact.confirmed:
             return motors_off(x, State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
         return x
 
     @property
     def tilted(self) -> bool:
         """Whether the specific force, by the IMU, does not point along b3."""
-        return self._carried is not None and self._carried.tilted
+        return self._tilted_contact is not None and self._tilted_contact.tilted
 
     def act(self, x: FlightState) -> FlightState:
         """Monitor one step of a flight; return the state, in another mode where necessary."""
         if x.mode is not self._mode:
             self.restart(x.mode)
-        if x.weak and not isinstance(x.source, WeakLanding) and (asked := self._beyond_what_is_left(x)):
-            return landing_weak(x, asked, self.settings.land_speed)
-        return WATCH[x.mode](self, x)
+        if x.weak and not isinstance(x.source, WeakLanding) and (reason := self._insufficient_thrust_reason(x)):
+            return landing_weak(x, reason, self.settings.land_speed)
+        return MONITORS[x.mode](self, x)
 
     def _landing(self, x: FlightState) -> FlightState:
         if isinstance(x.source, WeakLanding):
-            x.source.update(x.belief, x.specific_thrust_max)
+            x.source.update(x.state_estimate, x.specific_thrust_max)
         return x
 
     def _hovering(self, x: FlightState) -> FlightState:
-        return landing(x, "landing, as was ordered", self.settings.land_speed) if x.lands else self._on_reference(x)
+        return landing(x, "landing as commanded", self.settings.land_speed) if x.land_requested else self._on_reference(x)
 
     def _recovering(self, x: FlightState) -> FlightState:
         source = x.source
         if not isinstance(source, Recovery):
             return self._on_reference(x)  # a planned way out
-        source.update(x.belief, x.elapsed)
+        source.update(x.state_estimate, x.elapsed)
         if source.finished:
             if x.low:
                 return landing(x, "landing: the recovery ended at the ground", self.settings.land_speed)
-            return settled(x, "recovered: hovering")
+            return hover_after_recovery(x, "recovered: hovering")
         if x.elapsed > TIMEOUT:
             return landing(x, "landing: the recovery did not come to rest", self.settings.land_speed)
         return x
 
     def _on_reference(self, x: FlightState) -> FlightState:
         s, speed = self.settings, self.settings.land_speed
-        deviation = self._monitor.deviation(x.belief, self.wanted(x), x.now)
-        outside = self._monitor.outside(x.belief[0:3])
+        deviation = self._monitor.deviation(x.state_estimate, self.setpoint(x), x.now)
+        outside = self._monitor.outside(x.state_estimate[0:3])
         if deviation:
             return recovered(x, deviation)
         if outside > _FENCE_SLACK:
@@ -125,10 +125,10 @@ class Supervisor:
 
     def _at_end(self, x: FlightState, order: Order, over: float) -> FlightState:
         if order.at_end is AtEnd.CONTACT:
-            speed = norm(x.belief[3:6])
+            speed = norm(x.state_estimate[3:6])
             if over > order.contact_time:
                 return recovered(x, "contact was missed")
-            if over > 0.0 and speed > _MISSED_SPEED:  # what holds does not fall
+            if over > 0.0 and speed > _MISSED_SPEED:  # an attached vehicle does not fall
                 return recovered(x, f"contact was missed, falling with {speed:.1f} m/s")
         elif over >= 0.0:
             if order.at_end is AtEnd.LAND:
@@ -136,33 +136,34 @@ class Supervisor:
             return stopped(x, f"hovering at the end of trajectory {order.id}")
         return x
 
-    def _beyond_what_is_left(self, x: FlightState) -> str:
+    def _insufficient_thrust_reason(self, x: FlightState) -> str:
         """Return why weak rotors cannot continue the running manoeuvre; empty: they can."""
         left = x.specific_thrust_max
-        said = f"at most {100.0 * left / GRAVITY:.0f} % of the weight is left"
-        upright = axes_of(x.belief[6:10])[2][2] >= _UPRIGHT
+        limit_text = f"at most {100.0 * left / GRAVITY:.0f} % of the weight is left"
+        upright = axes_of(x.state_estimate[6:10])[2][2] >= _UPRIGHT
         if x.order is not None:
             if upright and x.order.at_end is AtEnd.CONTACT:
-                return f"{said}, too little to recover from a missed contact"
-            if self._judged is None or self._judged[0] is not x.source or self._judged[1] is not x.vehicle:
-                self._judged = x.source, x.vehicle, peak_thrust(x.source, x.elapsed) > RESERVE * left
-            return f"{said}, less than the trajectory needs" if self._judged[2] else ""
+                return f"{limit_text}, too little to recover from a missed contact"
+            if self._thrust_check is None or self._thrust_check[0] is not x.source or self._thrust_check[1] is not x.vehicle:
+                self._thrust_check = x.source, x.vehicle, peak_thrust(x.source, x.elapsed) > RESERVE * left
+            return f"{limit_text}, less than the trajectory needs" if self._thrust_check[2] else ""
         if x.mode is State.RECOVERING and not upright:
             return ""
-        return said if left < HOVER_LEAST * GRAVITY else ""
+        return limit_text if left < HOVER_MIN * GRAVITY else ""
 
     def landed(self, x: FlightState, setpoint: Setpoint) -> bool:
         """Whether the ground carries the vehicle: for some time it has not followed the descent."""
         if x.mode is not State.LANDING:
             return False
         if isinstance(x.source, WeakLanding):
-            resting = x.source.resting(x.belief)
+            resting = x.source.resting(x.state_estimate)
         else:
-            resting = abs(x.belief[5]) < min(_GROUND_SPEED, 0.5 * self.settings.land_speed) and x.belief[2] - setpoint.p[2] > _GROUND_GAP
+            height, climb = x.state_estimate[2], x.state_estimate[5]
+            resting = abs(climb) < min(_GROUND_SPEED, 0.5 * self.settings.land_speed) and height - setpoint.p[2] > _GROUND_GAP
         return self._ground.update(resting, x.now)
 
 
-WATCH: dict[State, Callable[[Supervisor, FlightState], FlightState]] = {
+MONITORS: dict[State, Callable[[Supervisor, FlightState], FlightState]] = {
     State.TRACKING: Supervisor._on_reference,
     State.HOVERING: Supervisor._hovering,
     State.RECOVERING: Supervisor._recovering,

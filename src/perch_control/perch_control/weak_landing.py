@@ -15,16 +15,16 @@ from perch_core.vector3 import axes_of, limited, scale
 from perch_core.vehicle import GRAVITY
 
 _GAIN = 8.0        # of the vertical speed [1/s]
-_SIDE_GAIN = 4.0   # of the speed across [1/s]
-_LEAST = 0.6       # thrust / weight at least, so that the rotors keep their moment
+_SIDE_GAIN = 4.0   # of the horizontal speed [1/s]
+_SHARE_MIN = 0.6   # thrust / weight at least, so that the rotors keep their moment
 _LEVEL = 0.08      # level below this height [m], and ...
 _PER_HEIGHT = 1.5  # ... leaning by at most so much per height above it [rad/m]
-_LEAN_LEAST = radians(2.0)
+_LEAN_MIN = radians(2.0)   # [rad]
 _NEARLY_UPRIGHT = 0.9
-_GENTLE = 0.08    # [rad]
-_LEAN = radians(15.0)       # it leans so far to brake its speed across, or as far as the weight is still carried ... [rad]
-_LEAN_MOST = radians(30.0)  # ... but no further than this [rad]
-_TOUCH_SPEED = 1.2          # it does not lean where it would touch the ground faster than this [m/s]
+_TURN_AHEAD = 0.08  # angle by which the commanded direction leads the present one [rad]
+_LEAN = radians(15.0)      # it leans so far to brake its horizontal speed, or as far as the weight is still carried ... [rad]
+_LEAN_MAX = radians(30.0)  # ... but no further than this [rad]
+_TOUCH_SPEED = 1.2         # it does not lean where it would touch the ground faster than this [m/s]
 _DELAY = 0.1       # until the rotors have answered [s]
 
 
@@ -43,22 +43,22 @@ class WeakLanding(ByState):
 
     def update(self, state: tuple[float, ...], specific_thrust_max: float) -> None:
         """Compute the demand from the present state and the greatest remaining collective thrust / mass [m/s^2]."""
-        p, v, most = state[0:3], state[3:6], specific_thrust_max
-        carried = acos(min(GRAVITY / most, 1.0))
-        lean = min(max(carried, _LEAN), _LEAN_MOST)
+        p, v, thrust_max = state[0:3], state[3:6], specific_thrust_max
+        carried = acos(min(GRAVITY / thrust_max, 1.0))
+        lean = min(max(carried, _LEAN), _LEAN_MAX)
         height = p[2] - self._ground
         fall = max(v[2] ** 2 - _TOUCH_SPEED**2, 0.0) if v[2] < 0.0 else 0.0
-        needed = (GRAVITY + 0.5 * fall / max(height + _DELAY * v[2], 0.05)) / most  # thrust that stops the fall, as a share
+        needed = (GRAVITY + 0.5 * fall / max(height + _DELAY * v[2], 0.05)) / thrust_max  # thrust that stops the fall, as a share
         lean = min(lean, acos(min(needed, 1.0))) if fall > 0.0 else lean
-        lean = max(min(lean, _PER_HEIGHT * (height - _LEVEL)), _LEAN_LEAST)
-        side = limited((-_SIDE_GAIN * v[0], -_SIDE_GAIN * v[1], 0.0), most * sin(lean))
-        top = sqrt(max(most**2 - side[0] ** 2 - side[1] ** 2, 0.0))
-        up = min(max(GRAVITY - _GAIN * (v[2] + self._speed), _LEAST * GRAVITY), top)
+        lean = max(min(lean, _PER_HEIGHT * (height - _LEVEL)), _LEAN_MIN)
+        side = limited((-_SIDE_GAIN * v[0], -_SIDE_GAIN * v[1], 0.0), thrust_max * sin(lean))
+        top = sqrt(max(thrust_max**2 - side[0] ** 2 - side[1] ** 2, 0.0))
+        up = min(max(GRAVITY - _GAIN * (v[2] + self._speed), _SHARE_MIN * GRAVITY), top)
         f = (side[0], side[1], up)
         b1, _, b3 = axes_of(state[6:10])
         if fall > 0.0 and b3[2] > _NEARLY_UPRIGHT:  # moments cost thrust, the small tilt costs less: turn gently
-            direction = towards(f, b1, b3, _GENTLE)
-            f = scale(most, direction) if direction is not None else f
+            direction = towards(f, b1, b3, _TURN_AHEAD)
+            f = scale(thrust_max, direction) if direction is not None else f
         self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=self._setpoint.h)
 
     def setpoint(self, t: float) -> Setpoint:

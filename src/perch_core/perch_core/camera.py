@@ -20,7 +20,7 @@ from perch_core.arrays import Array
 from perch_core.errors import ConfigError
 from perch_core.jit import interpreted
 
-IMAGE_LEAST = 16  # width and height of the smallest image [px]
+IMAGE_SIZE_MIN = 16  # width and height of the smallest image [px]
 Region = tuple[slice, slice]  # rows and columns of an image
 
 
@@ -301,8 +301,8 @@ def camera_of(model: str, width: int, height: int, K: Array, distortion: Array) 
         raise ConfigError("camera_info", "k", f"{K.ravel().tolist()} is no intrinsic matrix: the camera is not calibrated")
     if not np.isfinite(d).all():
         raise ConfigError("camera_info", "d", f"{d.tolist()} is not finite")
-    if not IMAGE_LEAST <= width <= 1 << 15 or not IMAGE_LEAST <= height <= 1 << 15:
-        raise ConfigError("camera_info", "width", f"{width} x {height} px is no size of an image that anything is found in")
+    if not IMAGE_SIZE_MIN <= width <= 1 << 15 or not IMAGE_SIZE_MIN <= height <= 1 << 15:
+        raise ConfigError("camera_info", "width", f"{width} x {height} px: each must be within [{IMAGE_SIZE_MIN}, {1 << 15}] px")
     common = int(width), int(height), float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     counts = {"": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8), "equidistant": (0, 4)}
     if model not in counts:

@@ -69,7 +69,7 @@ class Input(_Port, Generic[V]):
             value: type of the values.
             channel: relative name of the topic.
             lazy: values may wait until the next input that is not lazy, at most a few hundredths of a second: a message that
-                wakes a process costs 50 to 100 us, one that is taken together with another 5 us.
+                wakes a process costs 50 to 100 us, one that is read together with another 5 us.
             answered: the component checks the limits itself, because it answers refused values, too.
         """
         super().__init__(channel)
@@ -95,23 +95,23 @@ class Output(_Port, Generic[V]):
 class Emitter(Generic[V]):
     """Output of one component; a call passes the value to every receiver."""
 
-    __slots__ = ("receivers", "asked")
+    __slots__ = ("receivers", "receiver_check")
 
     def __init__(self) -> None:
         self.receivers: list[Callable[[V], None]] = []
-        self.asked: Callable[[], bool] | None = None  # set by a host that can tell whether anybody listens
+        self.receiver_check: Callable[[], bool] | None = None  # set by a host that can check whether there are subscribers
 
     def __call__(self, value: V) -> None:
         for receive in self.receivers:
             receive(value)
 
     @property
-    def wanted(self) -> bool:
+    def has_receivers(self) -> bool:
         """Whether a value would have a receiver; without one, the component may skip costly values."""
-        return bool(self.receivers) if self.asked is None else self.asked()
+        return bool(self.receivers) if self.receiver_check is None else self.receiver_check()
 
 
-class Wake(_Port):
+class Timer(_Port):
     """Periodic call of `on_<name>(now)` with the host's time [ns], also while no input arrives.
 
     The host's time may differ from that of the stamps: compare it only with itself.
@@ -222,11 +222,11 @@ def run_now(job: Job) -> None:
 
 @dataclass(frozen=True)
 class LogLine:
-    """A log line. `level`: debug, info, warning or error. `every`: least wall-clock time between two lines of its kind [s]."""
+    """A log line. `level`: debug, info, warning or error. `min_interval`: least wall-clock time between lines of its kind [s]."""
 
     level: str
     text: str
-    every: float = 0.0
+    min_interval: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -264,9 +264,9 @@ class Component(Generic[C]):
         """Wrap each handler of values that have limits in a check of these limits."""
         super().__init_subclass__(**kwargs)
         for port in ports(cls, Input):
-            take = vars(cls).get(f"on_{port.name}")
-            if take is not None and port.value in LIMITS and not port.answered:
-                setattr(cls, f"on_{port.name}", _behind_a_door(port, take))
+            handler = vars(cls).get(f"on_{port.name}")
+            if handler is not None and port.value in LIMITS and not port.answered:
+                setattr(cls, f"on_{port.name}", _with_limit_check(port, handler))
 
     def __init__(self, config: C) -> None:
         """
@@ -306,20 +306,20 @@ class Component(Generic[C]):
         """Log a line."""
         self.log(LogLine("info", text))
 
-    def warn(self, text: str, every: float = 0.0) -> None:
-        """Log a warning, at most one of its kind in `every` seconds."""
-        self.log(LogLine("warning", text, every))
+    def warn(self, text: str, min_interval: float = 0.0) -> None:
+        """Log a warning, at most one of its kind per `min_interval` [s]."""
+        self.log(LogLine("warning", text, min_interval))
 
 
-def _behind_a_door(port: Input[V], take: Callable[[Any, V], None]) -> Callable[[Any, V], None]:
-    @wraps(take)
-    def taken(self: Component[Any], value: V) -> None:
-        if said := problem(value):
-            self.warn(f"{port.channel(self)}: {said}: refused", every=1.0)
+def _with_limit_check(port: Input[V], handler: Callable[[Any, V], None]) -> Callable[[Any, V], None]:
+    @wraps(handler)
+    def checked(self: Component[Any], value: V) -> None:
+        if reason := problem(value):
+            self.warn(f"{port.channel(self)}: {reason}: refused", min_interval=1.0)
         else:
-            take(self, value)
+            handler(self, value)
 
-    return taken
+    return checked
 
 
 P = TypeVar("P", bound=_Port)
@@ -327,13 +327,13 @@ P = TypeVar("P", bound=_Port)
 
 def ports(component: type[Component[Any]], kind: type[P]) -> Iterator[P]:
     """Yield the ports of a class, in the order of their declaration, those of its bases first."""
-    seen: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for cls in reversed(component.__mro__):
         for name, value in vars(cls).items():
             if isinstance(value, _Port):
-                seen[name] = value
-            elif name in seen:
-                del seen[name]
-    for value in seen.values():
+                found[name] = value
+            elif name in found:
+                del found[name]
+    for value in found.values():
         if isinstance(value, kind):
             yield value

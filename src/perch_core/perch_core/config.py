@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 T = TypeVar("T", bound="DataclassInstance")
-LARGEST = {"m": 1e4, "m/s": 100.0, "m/s^2": 1e3, "m/s^3": 1e5, "rad": 1e3, "rad/s": 1e4, "rad/s^2": 1e4, "deg": 360.0, "s": 3600.0, "Hz": 1e4,
+DEFAULT_BOUNDS = {"m": 1e4, "m/s": 100.0, "m/s^2": 1e3, "m/s^3": 1e5, "rad": 1e3, "rad/s": 1e4, "rad/s^2": 1e4, "deg": 360.0, "s": 3600.0, "Hz": 1e4,
            "kg": 50.0, "kg m^2": 10.0, "N": 1e3, "N/s": 1e5, "N s/m": 100.0, "N s^2/rad^2": 1e-2, "px": 1e4}
 """Default bound on the magnitude of a quantity, by unit; far beyond the values of any supported vehicle."""
-LARGEST_NUMBER = 1e6
+FALLBACK_BOUND = 1e6
 """Default bound on the magnitude of every other number."""
-LONGEST_TEXT = 2000
+TEXT_LENGTH_MAX = 2000
 NAME = re.compile(r"\w[\w .+-]{0,99}")
 """Pattern of names that are used for folders, files or topics."""
 
@@ -39,9 +39,9 @@ def quantity(default: Any = MISSING, *, unit: str = "", low: float | None = None
              doc: str = "", above: float | None = None) -> Any:
     """Declare a number (or tuple of numbers) with unit and range; `low`/`high` are inclusive, `above` is exclusive.
 
-    A missing bound is taken from `LARGEST`.
+    A missing bound is taken from `DEFAULT_BOUNDS`.
     """
-    largest = LARGEST.get(unit, LARGEST_NUMBER)
+    largest = DEFAULT_BOUNDS.get(unit, FALLBACK_BOUND)
     low, high = -largest if low is None and above is None else low, largest if high is None else high
     return field(default=default, metadata={"unit": unit, "low": low, "high": high, "above": above, "doc": doc})
 
@@ -86,11 +86,11 @@ def check(source: str, key: str, item: Field[Any], value: Any) -> None:
     options = meta.get("options")
     if options is not None and value not in options:
         raise ConfigError(source, key, f"{value!r} is not one of {', '.join(options)}")
-    if isinstance(value, str) and (len(value) > LONGEST_TEXT or not "".join(value.split()).isprintable()):
-        raise ConfigError(source, key, f"{value!r} is not text of up to {LONGEST_TEXT} printable characters")
+    if isinstance(value, str) and (len(value) > TEXT_LENGTH_MAX or not "".join(value.split()).isprintable()):
+        raise ConfigError(source, key, f"{value!r} is not text of up to {TEXT_LENGTH_MAX} printable characters")
     if meta.get("label") and not NAME.fullmatch(value):
         raise ConfigError(source, key, f"{value!r} is no name: up to 100 letters, digits and any of ' _.+-' after the first")
-    low, high, above = meta.get("low", -LARGEST_NUMBER), meta.get("high", LARGEST_NUMBER), meta.get("above")
+    low, high, above = meta.get("low", -FALLBACK_BOUND), meta.get("high", FALLBACK_BOUND), meta.get("above")
     for number in _numbers(value):
         if number != item.default and not (number <= high and (number >= low if above is None else number > above)):
             span = f"{f'[{low:g}' if above is None else f'({above:g}'}, {high:g}] {meta.get('unit', '')}".rstrip()

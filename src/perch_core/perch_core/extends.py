@@ -10,7 +10,7 @@ from perch_core import config
 from perch_core.errors import ConfigError
 
 EXTENDS = "extends"
-LONGEST_CHAIN = 10
+CHAIN_MAX = 10
 
 
 def extended_mapping(kind: str, name_or_path: str | Path) -> dict[str, Any]:
@@ -24,15 +24,15 @@ def extended_mapping(kind: str, name_or_path: str | Path) -> dict[str, Any]:
     Raises:
         ConfigError: no such file, a file that is no mapping, or a cycle of files; the message names the chain of files.
     """
-    return _merged(kind, config.find(kind, name_or_path), ())
+    return _load_merged(kind, config.find(kind, name_or_path), ())
 
 
-def _merged(kind: str, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
+def _load_merged(kind: str, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
     source = " extends ".join(str(file) for file in (*chain, path))
     if path.resolve() in (file.resolve() for file in chain):
         raise ConfigError(source, EXTENDS, "the files extend each other in a circle")
-    if len(chain) == LONGEST_CHAIN:
-        raise ConfigError(source, EXTENDS, f"more than {LONGEST_CHAIN} files extend each other")
+    if len(chain) == CHAIN_MAX:
+        raise ConfigError(source, EXTENDS, f"more than {CHAIN_MAX} files extend each other")
     content = config.read_yaml(path) or {}
     if not isinstance(content, dict):
         raise ConfigError(source, "", f"{content!r} is not a mapping")
@@ -45,13 +45,13 @@ def _merged(kind: str, path: Path, chain: tuple[Path, ...]) -> dict[str, Any]:
         found = config.find(kind, path.parent / base if base.endswith((".yaml", ".yml")) else base)
     except ConfigError as error:
         raise ConfigError(source, EXTENDS, str(error)) from None
-    return _over(_merged(kind, found, (*chain, path)), content)
+    return _merge(_load_merged(kind, found, (*chain, path)), content)
 
 
-def _over(base: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(base: Mapping[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
     """Return `base` with `content` merged over it."""
     out = dict(base)
     for key, value in content.items():
-        below = out.get(key)
-        out[key] = _over(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        inner = out.get(key)
+        out[key] = _merge(inner, value) if isinstance(inner, dict) and isinstance(value, dict) else value
     return out

@@ -79,8 +79,8 @@ class IsolatedRunner:
         self._lock = threading.Lock()  # around `_closing` and `_process`
         self._closing = False
         self._started, self._ready, self._problem = threading.Event(), False, ""
-        self._wake, self._woken = socket.socketpair()
-        self._wake.setblocking(False)
+        self._wake_sender, self._wake_receiver = socket.socketpair()
+        self._wake_sender.setblocking(False)
         # The supervisor ends with the thread that starts it, which is this one.
         self._thread = threading.Thread(target=self._serve, name="isolated jobs", daemon=True)
         self._thread.start()
@@ -124,11 +124,11 @@ class IsolatedRunner:
             return failed
         with self._lock:
             if self._closing or len(self._tasks) >= WAITING_MAX:
-                why = "the runner is closed" if self._closing else f"{WAITING_MAX} others are waiting"
-                task.future.set_exception(JobFailed(f"{name}: {why}"))
+                reason = "the runner is closed" if self._closing else f"{WAITING_MAX} others are waiting"
+                task.future.set_exception(JobFailed(f"{name}: {reason}"))
                 return task.future
             self._tasks.append(task)
-            self._call()
+            self._wake_thread()
         return task.future
 
     def close(self) -> None:
@@ -136,15 +136,15 @@ class IsolatedRunner:
         with self._lock:
             if not self._closing:
                 self._closing = True
-                self._call()
+                self._wake_thread()
                 self._kill()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout=5.0)
 
-    def _call(self) -> None:
+    def _wake_thread(self) -> None:
         """Wake the runner's thread, so that it checks for work."""
         with suppress(BlockingIOError):  # it has been called often enough
-            self._wake.send(b".")
+            self._wake_sender.send(b".")
 
     # -- the runner's thread -------------------------------------------------------------------------------------------
 
@@ -152,19 +152,19 @@ class IsolatedRunner:
         self._start()
         while not self._closing:
             if self._ready and self._tasks:
-                self._do(self._tasks.popleft())
+                self._run(self._tasks.popleft())
                 continue
-            if self._heard():
-                self._hear()
+            if self._wait_for_data():
+                self._receive_status()
             if self._pipe is None and self._tasks and not self._closing:
                 self._start()  # the last start failed: once more for this job
         self._end()
         for task in self._tasks:
             _fail(task, JobFailed(f"{task.name}: the runner was closed"))
-        for end in (self._wake, self._woken):
+        for end in (self._wake_sender, self._wake_receiver):
             end.close()
 
-    def _heard(self, until: float = inf) -> bool:
+    def _wait_for_data(self, until: float = inf) -> bool:
         """Wait for the supervisor, a wake-up call or a time; queued jobs whose limit has passed fail.
 
         Args:
@@ -173,16 +173,16 @@ class IsolatedRunner:
         Returns:
             Whether the supervisor's pipe has data.
         """
-        soonest = min([until, *(task.end for task in self._waiting())])
-        pipes: list[socket.socket | Connection] = [self._woken] if self._pipe is None else [self._woken, self._pipe]
-        heard = wait(pipes, None if soonest == inf else max(0.0, soonest - time.monotonic()))
-        if self._woken in heard:
-            self._woken.recv(4096)
+        deadline = min([until, *(task.end for task in self._waiting())])
+        pipes: list[socket.socket | Connection] = [self._wake_receiver] if self._pipe is None else [self._wake_receiver, self._pipe]
+        ready = wait(pipes, None if deadline == inf else max(0.0, deadline - time.monotonic()))
+        if self._wake_receiver in ready:
+            self._wake_receiver.recv(4096)
         for task in [task for task in self._waiting() if task.end <= time.monotonic()]:
             with self._lock:
                 self._tasks.remove(task)
-            _fail(task, self._late(task))
-        return self._pipe in heard
+            _fail(task, self._timed_out(task))
+        return self._pipe in ready
 
     def _waiting(self) -> list[_Task]:
         """Return a copy of the queue; other threads may append to the queue meanwhile."""
@@ -191,31 +191,31 @@ class IsolatedRunner:
 
     def _start(self) -> None:
         """Start a supervisor and send it its set-up and preload."""
-        mine, theirs = Pipe()
+        parent_end, child_end = Pipe()
         self._ready, self._problem = False, ""
         self._started.clear()
         with self._lock:
             if self._closing:
                 return
-            command = [*self._command, str(theirs.fileno()), str(os.getpid())]
+            command = [*self._command, str(child_end.fileno()), str(os.getpid())]
             # BLAS on one thread: so do all nodes, and a process with threads cannot be forked.
             environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-            self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), process_group=0, env=environment)
-        theirs.close()
-        self._pipe = mine
-        with suppress(OSError):  # it ended already: `_hear` finds out
-            mine.send(self._setup)
-            mine.send_bytes(self._preload)
+            self._process = subprocess.Popen(command, pass_fds=(child_end.fileno(),), process_group=0, env=environment)
+        child_end.close()
+        self._pipe = parent_end
+        with suppress(OSError):  # it ended already: `_receive_status` finds out
+            parent_end.send(self._setup)
+            parent_end.send_bytes(self._preload)
 
-    def _hear(self) -> None:
+    def _receive_status(self) -> None:
         """Receive the supervisor's report that it is ready, or why not; if it has ended after it was ready, start another one."""
         assert self._pipe is not None
         try:
             answer = self._pipe.recv_bytes().decode()
         except (EOFError, OSError):
-            answer, worked = "it ended", self._ready
+            answer, was_ready = "it ended", self._ready
             self._end()
-            if worked:
+            if was_ready:
                 self._start()
                 return
         if answer == "ready":
@@ -227,21 +227,21 @@ class IsolatedRunner:
                 _fail(self._tasks.popleft(), JobFailed(self._problem))
         self._started.set()
 
-    def _do(self, task: _Task) -> None:
+    def _run(self, task: _Task) -> None:
         """Run one job and complete its future."""
-        left = task.end - time.monotonic()
-        if left <= 0.0:
-            _fail(task, self._late(task))
+        remaining = task.end - time.monotonic()
+        if remaining <= 0.0:
+            _fail(task, self._timed_out(task))
             return
         if not task.future.running() and not task.future.set_running_or_notify_cancel():
             return
         assert self._pipe is not None
         try:
-            self._pipe.send_bytes(_HEADER.pack(left) + task.payload)
-            while not self._heard(task.end + _GRACE):
+            self._pipe.send_bytes(_HEADER.pack(remaining) + task.payload)
+            while not self._wait_for_data(task.end + _GRACE):
                 if time.monotonic() >= task.end + _GRACE:
                     raise TimeoutError
-            kind, answer = _opened(self._pipe.recv_bytes())
+            kind, answer = _decode_answer(self._pipe.recv_bytes())
         except TimeoutError:
             self._restart()
             kind, answer = b"T", "its process did not answer"
@@ -261,9 +261,9 @@ class IsolatedRunner:
         else:
             task.future.set_exception(JobFailed(f"{task.name}: {answer}"))
 
-    def _late(self, task: _Task) -> JobStopped:
-        waited = "other jobs were being done" if self._ready else "the process for it was not ready"
-        return JobStopped(f"{task.name}: not begun within {task.limit:g} s: {waited}")
+    def _timed_out(self, task: _Task) -> JobStopped:
+        cause = "other jobs were running" if self._ready else "its process was not ready"
+        return JobStopped(f"{task.name}: not begun within {task.limit:g} s: {cause}")
 
     def _restart(self) -> None:
         self._end()
@@ -288,7 +288,7 @@ class IsolatedRunner:
             self._pipe = None
 
 
-def _opened(answer: bytes) -> tuple[bytes, Any]:
+def _decode_answer(answer: bytes) -> tuple[bytes, Any]:
     """Return kind and content of an answer: A the result, E the exception, T stopped at the limit, F failed with a message."""
     kind, content = answer[:1], answer[1:]
     if kind in (b"T", b"F"):

@@ -25,25 +25,25 @@ OUT_OF_MEMORY = 42
 
 
 def _answer(payload: bytes, memory: int) -> bytes:
-    """Execute a job; return the answer in the format of `isolated._opened`."""
+    """Execute a job; return the answer in the format of `isolated._decode_answer`."""
     try:
         function, arguments = pickle.loads(payload)
         result = function(*arguments)
     except PerchError as error:
         return b"E" + pickle.dumps(error)
     except MemoryError:
-        return b"F" + _too_much(memory).encode()
+        return b"F" + _out_of_memory_text(memory).encode()
     except (Exception, SystemExit) as error:  # the caller must get an answer whatever happens here
         return b"F" + f"{type(error).__name__}: {error}".encode(errors="replace")
     try:
         return b"A" + pickle.dumps(result)
     except MemoryError:
-        return b"F" + _too_much(memory).encode()
+        return b"F" + _out_of_memory_text(memory).encode()
     except Exception as error:  # what pickle raises depends on what it is given
         return b"F" + f"what it returned cannot be sent: {error}".encode(errors="replace")
 
 
-def _too_much(memory: int) -> str:
+def _out_of_memory_text(memory: int) -> str:
     return f"out of memory: the limit of its process is {memory / 2**30:.3g} GiB"
 
 
@@ -64,23 +64,23 @@ def _child(pipe: Connection, supervisor: int, memory: int) -> None:
 
 
 def _fork(upstream: Connection, memory: int) -> tuple[int, Connection]:
-    mine, theirs = Pipe()
+    parent_end, child_end = Pipe()
     supervisor, pid = os.getpid(), os.fork()
     if pid == 0:
-        mine.close()
+        parent_end.close()
         upstream.close()
-        _child(theirs, supervisor, memory)
-    theirs.close()
-    return pid, mine
+        _child(child_end, supervisor, memory)
+    child_end.close()
+    return pid, parent_end
 
 
-def _ended(status: int, memory: int) -> str:
+def _exit_reason(status: int, memory: int) -> str:
     """Return why a child has ended, as text."""
     if os.WIFSIGNALED(status):
         name = signal.Signals(os.WTERMSIG(status)).name
         return f"its process crashed ({name}); the limit of its memory is {memory / 2**30:.3g} GiB"
     if os.WEXITSTATUS(status) == OUT_OF_MEMORY:
-        return _too_much(memory)
+        return _out_of_memory_text(memory)
     return f"its process ended itself (exit status {os.WEXITSTATUS(status)})"
 
 
@@ -107,7 +107,7 @@ def supervise(upstream: Connection) -> None:
             return
         answer = None
         while answer is None:
-            answer, ended = _do(job, child, upstream, pid, setup.memory)
+            answer, ended = _run(job, child, upstream, pid, setup.memory)
             if ended:
                 child.close()
                 if upstream.closed:
@@ -116,7 +116,7 @@ def supervise(upstream: Connection) -> None:
         upstream.send_bytes(answer)
 
 
-def _do(job: bytes, child: Connection, upstream: Connection, pid: int, memory: int) -> tuple[bytes | None, bool]:
+def _run(job: bytes, child: Connection, upstream: Connection, pid: int, memory: int) -> tuple[bytes | None, bool]:
     """Have a child execute a job.
 
     Returns:
@@ -130,7 +130,7 @@ def _do(job: bytes, child: Connection, upstream: Connection, pid: int, memory: i
         if child in ready:
             return child.recv_bytes(), False
     except EOFError:
-        return b"F" + _ended(os.waitpid(pid, 0)[1], memory).encode(), True
+        return b"F" + _exit_reason(os.waitpid(pid, 0)[1], memory).encode(), True
     except OSError:  # it was ended from outside between two jobs
         os.waitpid(pid, 0)
         return None, True

@@ -17,8 +17,8 @@ from perch_core.components import (
 from perch_core.errors import PerchError
 
 _E3 = np.array([0.0, 0.0, 1.0])
-_THINNEST = 1e-3        # radius that is left of a wire [m]
-_LEVEL_LEAST = 0.1      # sine of a line's angle from the vertical, below which a tilt about it means nothing
+_RADIUS_MIN = 1e-3      # radius that is left of a wire [m]
+_LEVEL_MIN = 0.1        # sine of a line's angle from the vertical, below which a tilt about it is not defined
 ACTIVATION_RAMP = 0.02  # length over which the end of a segment fades in [m]
 _STEEPNESS = float(np.arctanh(0.98))  # tanh reaches 1 % and 99 % at the ends of the ramp
 
@@ -58,9 +58,9 @@ class Segment:
         start, end = np.asarray(start, float), np.asarray(end, float)
         return cls((start + end) / 2, end - start, float(np.linalg.norm(end - start)) / 2, radius, id)
 
-    def thinner(self, by: float) -> Segment:
-        """Return the segment with its radius reduced by `by` [m]; a small radius always remains."""
-        return replace(self, radius=max(self.radius - by, min(self.radius, _THINNEST))) if by > 0.0 else self
+    def with_reduced_radius(self, reduction: float) -> Segment:
+        """Return the segment with its radius reduced by `reduction` [m]; a small radius always remains."""
+        return replace(self, radius=max(self.radius - reduction, min(self.radius, _RADIUS_MIN))) if reduction > 0.0 else self
 
     @property
     def ends(self) -> tuple[Array, Array]:
@@ -108,8 +108,8 @@ def perch_normal(line: Segment, point: Array, pitch: float, side_W: Array) -> Ar
         PerchError: the line is vertical.
     """
     up = _E3 - (_E3 @ line.direction) * line.direction
-    if np.linalg.norm(up) < _LEVEL_LEAST:
-        raise PerchError(f"line {line.id} is vertical: a pitch about it means nothing")
+    if np.linalg.norm(up) < _LEVEL_MIN:
+        raise PerchError(f"line {line.id} is vertical: a pitch about it is not defined")
     up = up / np.linalg.norm(up)
     side = np.cross(line.direction, up)
     if (np.asarray(side_W, float) - point) @ side < 0:

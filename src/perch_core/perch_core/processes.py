@@ -38,14 +38,14 @@ def without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def give_way(task: int, nice: int) -> None:
+def lower_priority(task: int, nice: int) -> None:
     """Lower the priority of a thread (0: the caller): higher nice value, no preemption of other threads at wake-up (Linux)."""
     os.setpriority(os.PRIO_PROCESS, task, nice)
     with suppress(OSError, AttributeError):
         os.sched_setscheduler(task, os.SCHED_BATCH, os.sched_param(0))
 
 
-def one_thread_for_sums() -> None:
+def single_threaded_blas() -> None:
     """Restrict BLAS to one thread in this process, also where it is loaded already: several threads add in another order, which
     changes the last bits of a flight, and take longer for small matrices."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):

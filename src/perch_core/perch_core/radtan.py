@@ -41,7 +41,7 @@ def gain_slope(lens: tuple[float, ...], t: F) -> F:
 
 
 @compiled
-def _seen_at(lens: tuple[float, ...], x: float, y: float) -> tuple[float, float]:
+def _distorted(lens: tuple[float, ...], x: float, y: float) -> tuple[float, float]:
     """x' and y'."""
     t, p1, p2 = x * x + y * y, lens[6], lens[7]
     g = gain(lens, t)
@@ -75,41 +75,41 @@ def project(lens: tuple[float, ...], points: Array, pixels: Array, valid: np.nda
         if not valid[n]:
             pixels[n, 0] = pixels[n, 1] = math.nan
             continue
-        x, y = _seen_at(lens, points[n, 0] / z, points[n, 1] / z)
+        x, y = _distorted(lens, points[n, 0] / z, points[n, 1] / z)
         pixels[n, 0], pixels[n, 1] = lens[0] * x + lens[2], lens[1] * y + lens[3]
 
 
 @compiled
-def _undistorted(lens: tuple[float, ...], x_seen: float, y_seen: float) -> tuple[float, float]:
+def _undistorted(lens: tuple[float, ...], x_distorted: float, y_distorted: float) -> tuple[float, float]:
     """Return the point (x, y) that is imaged at (x', y'); NaN if there is none."""
-    seen = math.sqrt(x_seen * x_seen + y_seen * y_seen)
-    if not seen < math.inf:
+    r_distorted = math.sqrt(x_distorted * x_distorted + y_distorted * y_distorted)
+    if not r_distorted < math.inf:
         return math.nan, math.nan
     low, high = 0.0, lens[12]
     if high == math.inf:
         high = 1.0
-        while high * gain(lens, high * high) < seen and high < 1e6:
+        while high * gain(lens, high * high) < r_distorted and high < 1e6:
             high *= 2.0
     for _ in range(HALVINGS):
         r = 0.5 * (low + high)
-        if r * gain(lens, r * r) < seen:
+        if r * gain(lens, r * r) < r_distorted:
             low = r
         else:
             high = r
-    scale = high / seen if seen > 1e-12 else 1.0
-    x, y = x_seen * scale, y_seen * scale
+    scale = high / r_distorted if r_distorted > 1e-12 else 1.0
+    x, y = x_distorted * scale, y_distorted * scale
     for _ in range(NEWTON_STEPS):
-        x_now, y_now = _seen_at(lens, x, y)
-        ex, ey = x_seen - x_now, y_seen - y_now
-        if abs(ex) + abs(ey) <= RESIDUAL * (1.0 + seen):
+        x_now, y_now = _distorted(lens, x, y)
+        ex, ey = x_distorted - x_now, y_distorted - y_now
+        if abs(ex) + abs(ey) <= RESIDUAL * (1.0 + r_distorted):
             break
         xx, xy, yy = _slopes(lens, x, y)
         det = xx * yy - xy * xy
         if not abs(det) > 1e-12:
             return math.nan, math.nan
         x, y = x + (yy * ex - xy * ey) / det, y + (xx * ey - xy * ex) / det
-    x_now, y_now = _seen_at(lens, x, y)
-    if not (abs(x_seen - x_now) + abs(y_seen - y_now) <= 1e-11 * (1.0 + seen) and _regular(lens, x, y)):
+    x_now, y_now = _distorted(lens, x, y)
+    if not (abs(x_distorted - x_now) + abs(y_distorted - y_now) <= 1e-11 * (1.0 + r_distorted) and _regular(lens, x, y)):
         return math.nan, math.nan
     return x, y
 

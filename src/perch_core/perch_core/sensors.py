@@ -14,7 +14,7 @@ import numpy as np
 
 from perch_core import config, so3
 from perch_core.arrays import Quaternion, Vector3
-from perch_core.camera import IMAGE_LEAST, Camera, camera_of
+from perch_core.camera import IMAGE_SIZE_MIN, Camera, camera_of
 from perch_core.camera_mount import CameraMount
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError
@@ -41,8 +41,8 @@ class CameraSensor:
     """A camera as its calibration describes it."""
 
     model: str = choice(options=("radtan", "equidistant", "pinhole"), doc="projection, in Kalibr's words")
-    width: int = quantity(unit="px", low=IMAGE_LEAST, high=1 << 14)
-    height: int = quantity(unit="px", low=IMAGE_LEAST, high=1 << 14)
+    width: int = quantity(unit="px", low=IMAGE_SIZE_MIN, high=1 << 14)
+    height: int = quantity(unit="px", low=IMAGE_SIZE_MIN, high=1 << 14)
     focal: tuple[float, float] = quantity(unit="px", above=0.0, high=1e5, doc="fx, fy")
     centre: tuple[float, float] = quantity(unit="px", low=-1e4, high=2e4, doc="cx, cy")
     distortion: tuple[float, ...] = quantity((), low=-100.0, high=100.0, doc=(

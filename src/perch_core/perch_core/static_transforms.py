@@ -10,14 +10,14 @@ from perch_core import so3
 from perch_core.values import Transform
 
 BASE = "base_link"
-MOST = 1000  # frames kept
+FRAMES_MAX = 1000  # greatest number of frames
 
 
 class StaticTransforms:
     """A tree of frames, each with its pose in its parent."""
 
     def __init__(self) -> None:
-        self._placed: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # child -> parent, p, R
+        self._poses: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}  # child -> parent, p, R
 
     def add(self, transform: Transform) -> str:
         """Add a transform; it replaces an earlier one of the same child.
@@ -33,10 +33,10 @@ class StaticTransforms:
             return f"{name} has no unit quaternion: its norm is {math.hypot(*transform.q):.3g}"
         if not transform.parent or not transform.child or transform.parent == transform.child:
             return f"{name} does not name two frames"
-        if len(self._placed) >= MOST and transform.child not in self._placed:
-            return f"{name} is one of more than {MOST}"
+        if len(self._poses) >= FRAMES_MAX and transform.child not in self._poses:
+            return f"{name}: more than {FRAMES_MAX} frames"
         q = np.array(transform.q) / np.linalg.norm(transform.q)
-        self._placed[transform.child] = transform.parent, np.array(transform.p, float), so3.quat_to_matrix(q)
+        self._poses[transform.child] = transform.parent, np.array(transform.p, float), so3.quat_to_matrix(q)
         return ""
 
     def pose(self, child: str, parent: str = BASE) -> tuple[np.ndarray, np.ndarray] | None:
@@ -52,8 +52,8 @@ class StaticTransforms:
         """Return the pose of `frame` in itself and in each of its ancestors, nearest first."""
         p, R = np.zeros(3), np.eye(3)
         poses = {frame: (p, R)}
-        while frame in self._placed:
-            frame, p_step, R_step = self._placed[frame]
+        while frame in self._poses:
+            frame, p_step, R_step = self._poses[frame]
             if frame in poses:
                 break  # a loop
             p, R = p_step + R_step @ p, R_step @ R

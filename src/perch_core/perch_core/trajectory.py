@@ -205,7 +205,7 @@ class SampledTrajectory:
         """Return the trajectory with unit quaternions; those of a plan's samples have rounding errors."""
         return replace(self, q=self.q / np.linalg.norm(self.q, axis=1)[:, None])
 
-    def rest_of(self, since: float, offset: Array) -> SampledTrajectory:
+    def remainder(self, since: float, offset: Array) -> SampledTrajectory:
         """Return the remainder from a sample on, shifted in position.
 
         Args:

@@ -17,7 +17,7 @@ from perch_core.values import Transform
 
 IMU = "imu_link"
 ARM_WIDTH, ROTOR_HEIGHT, PLATE_HEIGHT = 0.012, 0.008, 0.006  # [m]
-ROTOR_RADIUS = 0.1  # where the vehicle's file does not tell [m]
+ROTOR_RADIUS = 0.1  # where the vehicle file has none [m]
 COLOURS = {"body": "0.25 0.25 0.25 0.6", "arm": "0.15 0.15 0.15 1", "front": "0.9 0.2 0.2 0.8", "rear": "0.25 0.25 0.25 0.8",
            "plate": "0.1 0.5 0.2 1", "camera": "0.1 0.1 0.4 1"}
 

@@ -12,7 +12,7 @@ from perch_core import config, so3
 from perch_core.arrays import Quaternion, Vector3, Vector4
 from perch_core.camera import Camera, EquidistantCamera, PinholeCamera
 from perch_core.camera_mount import CameraMount
-from perch_core.config import LARGEST, choice, label, part, quantity, text
+from perch_core.config import DEFAULT_BOUNDS, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.extends import extended_mapping
 from perch_core.sensors import check_quaternion
@@ -81,7 +81,7 @@ class ImuConfig:
 class Battery:
     """Thrust at a given throttle as a function of the battery voltage: (thrust at `reference`) (voltage / reference)^exponent."""
 
-    reference: float = quantity(0.0, unit="V", low=0.0, high=100.0, doc="at which the thrust curve holds; 0: the voltage is not looked at")
+    reference: float = quantity(0.0, unit="V", low=0.0, high=100.0, doc="at which the thrust curve holds; 0: the voltage is not used")
     exponent: float = quantity(2.0, low=0.5, high=4.0, doc="2: rotor speed proportional to voltage")
     range: tuple[float, float] = quantity((0.0, 100.0), unit="V", low=0.0, high=100.0, doc="between which it was identified")
 
@@ -124,7 +124,7 @@ class ControlGains:
     velocity: Vector3 = quantity((4.5, 4.5, 5.5), unit="1/s", low=0.0, high=100.0, doc="axes of W")
     attitude: Vector3 = quantity((420.0, 420.0, 60.0), unit="1/s^2", low=0.0, high=5000.0, doc="axes of B")
     rate: Vector3 = quantity((32.0, 32.0, 10.0), unit="1/s", low=0.0, high=500.0, doc="axes of B")
-    lead: float = quantity(0.02, unit="s", low=0.002, high=0.2, doc="time in which the rotors would reach the wanted thrust, if it stayed")
+    lead: float = quantity(0.02, unit="s", low=0.002, high=0.2, doc="time in which the rotors would reach a constant commanded thrust")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +142,7 @@ class Vehicle:
     speed_max: float = quantity(unit="rad/s", above=0.0)
     motor_time_constant: float = quantity(unit="s", low=0.0, high=1.0, doc="first-order lag of the rotor speed")
     thrust_rate_max: float = quantity(float("inf"), unit="N/s", above=0.0, doc="|u| of [P:eq14g], per rotor")
-    body_rate_max: float = quantity(unit="rad/s", above=0.0, doc="largest |omega| that a plan may ask for")
+    body_rate_max: float = quantity(unit="rad/s", above=0.0, doc="largest |omega| of a plan")
     drag: Vector3 = quantity((0.0, 0.0, 0.0), unit="N s/m", low=0.0, doc="linear rotor drag, axes of B")
     perch_offset: float = quantity(unit="m", low=0.0, high=1.0, doc="velcro or gripper below the centre of mass")
     stand_off: float = quantity(0.0, unit="m", low=0.0, high=0.2, doc="how far short of a wire the gripper is planned to stop")
@@ -161,12 +161,12 @@ class Vehicle:
         for key, problem in (
             ("rotor_xy", len(self.rotor_xy) != 4 and f"has {len(self.rotor_xy)} rotors, needs 4"),
             ("rotor_yaw_sign", 0 in self.rotor_yaw_sign and f"{list(self.rotor_yaw_sign)} are not each 1 or -1"),
-            ("inertia", most > 1.001 * (least + middle) and f"{most:g} is more than {least:g} + {middle:g} kg m^2, which no body has"),
+            ("inertia", most > 1.001 * (least + middle) and f"{most:g} is more than {least:g} + {middle:g} kg m^2, which is impossible for a rigid body"),
             ("inertia", most > self.mass * radius**2 and f"{most:g} kg m^2 is more than {self.mass:g} kg within {radius:g} m (body_radii) can have"),
             ("speed_max", self.speed_max <= self.speed_min and f"{self.speed_max:g} is not above speed_min {self.speed_min:g} rad/s"),
-            ("speed_max", self.thrust_max > LARGEST["N"] and f"{self.thrust_max:.4g} N of a rotor is outside (0, {LARGEST['N']:g}] N"),
+            ("speed_max", self.thrust_max > DEFAULT_BOUNDS["N"] and f"{self.thrust_max:.4g} N of a rotor is outside (0, {DEFAULT_BOUNDS['N']:g}] N"),
             ("speed_max", 4 * self.thrust_max <= self.hover_thrust and f"total thrust {4 * self.thrust_max:.2f} N cannot lift {self.mass:g} kg"),
-            ("speed_min", 4 * self.thrust_min >= self.hover_thrust and f"idling with {4 * self.thrust_min:.2f} N it cannot come down"),
+            ("speed_min", 4 * self.thrust_min >= self.hover_thrust and f"with an idle thrust of {4 * self.thrust_min:.2f} N it cannot descend"),
         ):
             if problem:
                 raise ConfigError("", key, problem)
@@ -194,7 +194,7 @@ class Vehicle:
         """Greatest thrust of one rotor [N]."""
         return self.thrust_coefficient * self.speed_max**2
 
-    def giving(self, ratio: float) -> Vehicle:
+    def with_thrust_ratio(self, ratio: float) -> Vehicle:
         """Return the vehicle with rotors that produce `ratio` times the thrust.
 
         Raises:

@@ -15,11 +15,11 @@ from yaml.events import AliasEvent, MappingStartEvent, NodeEvent, ScalarEvent, S
 
 from perch_core.errors import ConfigError
 
-BYTES = 1 << 20
-DEPTH = 20
-NODES = 20_000
-ENTRIES = 2_000  # of a list or a mapping
-WHOLE = 2**63 - 1  # the largest whole number
+BYTES_MAX = 1 << 20
+DEPTH_MAX = 20
+NODES_MAX = 20_000
+ENTRIES_MAX = 2_000  # of a list or a mapping
+INT_MAX = 2**63 - 1  # the largest integer
 
 
 _Safe: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml's, where there is one, is ten times as fast
@@ -29,9 +29,9 @@ class _Loader(_Safe):
     yaml_implicit_resolvers: dict[str, list[Any]] = {}
 
 
-def _whole(loader: _Loader, node: yaml.ScalarNode) -> int:
-    if len(node.value) > 20 or abs(int(node.value)) > WHOLE:
-        raise yaml.constructor.ConstructorError(None, None, "a whole number beyond 64 bits", node.start_mark)
+def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
+    if len(node.value) > 20 or abs(int(node.value)) > INT_MAX:
+        raise yaml.constructor.ConstructorError(None, None, "an integer beyond 64 bits", node.start_mark)
     return int(node.value)
 
 
@@ -43,7 +43,7 @@ for _tag, _pattern, _first in (
     ("merge", "<<", ["<"]),
 ):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"(?:{_pattern})\Z"), _first)
-_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
+_Loader.add_constructor("tag:yaml.org,2002:int", _integer)
 
 
 def read_yaml(path: Path | str) -> Any:
@@ -54,11 +54,11 @@ def read_yaml(path: Path | str) -> Any:
     """
     try:
         with open(path, "rb") as file:
-            content = file.read(BYTES + 1)
+            content = file.read(BYTES_MAX + 1)
     except OSError as error:
         raise ConfigError(str(path), "", f"cannot be read: {error.strerror}") from None
-    if len(content) > BYTES:
-        raise ConfigError(str(path), "", f"has more than {BYTES} bytes")
+    if len(content) > BYTES_MAX:
+        raise ConfigError(str(path), "", f"has more than {BYTES_MAX} bytes")
     try:
         return parse_yaml(content.decode("utf-8"), str(path))
     except UnicodeDecodeError:
@@ -82,7 +82,7 @@ def parse_yaml(text: str, source: str) -> Any:
         raise ConfigError(source, "", f"is not valid YAML: {error}") from None
 
 
-class _Open:
+class _OpenCollection:
     """A list or mapping whose end event has not been read."""
 
     def __init__(self, event: NodeEvent, before: int) -> None:
@@ -93,7 +93,7 @@ class _Open:
 def _scan(text: str, source: str) -> None:
     """Refuse duplicate keys, tags and excessive content before any value is built."""
     nodes = 0
-    path: list[_Open] = []
+    path: list[_OpenCollection] = []
     anchors: dict[str, tuple[int, int]] = {}  # name -> values, levels
     for event in yaml.parse(text, _Loader):
         def refuse(problem: str) -> None:
@@ -110,26 +110,26 @@ def _scan(text: str, source: str) -> None:
             elif isinstance(event, ScalarEvent) and event.anchor is not None:
                 anchors[event.anchor] = 1, 0
             nodes += weight
-            if nodes > NODES:
-                refuse(f"more than {NODES} values")
-            if len(path) + height > DEPTH:
-                refuse(f"more than {DEPTH} levels")
+            if nodes > NODES_MAX:
+                refuse(f"more than {NODES_MAX} values")
+            if len(path) + height > DEPTH_MAX:
+                refuse(f"more than {DEPTH_MAX} levels")
             if path:
-                inside = path[-1]
-                if inside.keys is not None and inside.entries % 2 == 0:
+                parent = path[-1]
+                if parent.keys is not None and parent.entries % 2 == 0:
                     if not isinstance(event, ScalarEvent):
-                        refuse("a key that is no word")
-                    if event.value in inside.keys:
-                        refuse(f"key {event.value!r} stands here twice")
-                    inside.keys.add(event.value)
-                inside.entries += 1
-                inside.height = max(inside.height, 1 + height)
-                if inside.entries > ENTRIES:
-                    refuse(f"more than {ENTRIES} entries")
+                        refuse("a key that is not a scalar")
+                    if event.value in parent.keys:
+                        refuse(f"duplicate key {event.value!r}")
+                    parent.keys.add(event.value)
+                parent.entries += 1
+                parent.height = max(parent.height, 1 + height)
+                if parent.entries > ENTRIES_MAX:
+                    refuse(f"more than {ENTRIES_MAX} entries")
             if isinstance(event, (MappingStartEvent, SequenceStartEvent)):
-                path.append(_Open(event, nodes - 1))
-                if len(path) > DEPTH:
-                    refuse(f"more than {DEPTH} levels")
+                path.append(_OpenCollection(event, nodes - 1))
+                if len(path) > DEPTH_MAX:
+                    refuse(f"more than {DEPTH_MAX} levels")
         elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
             done = path.pop()
             if done.anchor is not None:

@@ -29,25 +29,25 @@ def command_parser(name: str, description: str | None, examples: str) -> argpars
     return argparse.ArgumentParser(prog=name, description=description, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
-def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argparse.Namespace], int], *mistakes: type[Exception],
+def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argparse.Namespace], int], *refusals: type[Exception],
             interrupted: str = "interrupted") -> Callable[..., int]:
     """A program's `main`; it ends with what its work returns, 2 with one line where it is refused, 130 where it is interrupted.
 
     Args:
         parser: makes the command line.
         work: what is done with its arguments.
-        mistakes: what else the caller is to blame for, beside `PerchError` and `OSError`.
-        interrupted: said after Ctrl-C.
+        refusals: errors beside `PerchError` and `OSError` that mean invalid input.
+        interrupted: printed after Ctrl-C.
     """
-    callers: tuple[type[Exception], ...] = (OSError, PerchError, *mistakes)
+    errors: tuple[type[Exception], ...] = (OSError, PerchError, *refusals)
 
     def main(arguments: list[str] | None = None) -> int:
         args = parser().parse_args(arguments)
         try:
             return work(args)
-        except callers as error:
-            words = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
-            print(f"error: {words}", file=sys.stderr)
+        except errors as error:
+            text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
+            print(f"error: {text}", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
             print(interrupted, file=sys.stderr)

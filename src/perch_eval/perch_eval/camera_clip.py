@@ -1,4 +1,4 @@
-"""What the cameras saw around a perch: one looping animation (WebP) of all cameras side by side."""
+"""The camera images around a perch: one looping animation (WebP) of all cameras side by side."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from perch_eval.metrics import perch_window
 
 CAMERAS = ("front", "down")
 HEIGHT = 270  # of the animation [px]
-BEFORE, AFTER, LONGEST = 1.0, 1.0, 10.0  # shown around the perch, and at the most where there is none [s]
+BEFORE, AFTER, MAX_DURATION = 1.0, 1.0, 10.0  # shown around the perch, and at the most where there is none [s]
 PAUSE = 1.0   # on the last frame [s]
 
 
@@ -26,7 +26,7 @@ def clip(flight: Flight) -> str:
         return ""
     last = max(images[-1][0] for images in recorded.values())
     window = perch_window(flight)
-    start, end = (window[0] - BEFORE, window[1] + AFTER) if window else (last - LONGEST, last)
+    start, end = (window[0] - BEFORE, window[1] + AFTER) if window else (last - MAX_DURATION, last)
     times = [t for t, _ in next(iter(recorded.values())) if start <= t <= end]
     if not times:
         return ""

@@ -1,4 +1,4 @@
-"""How a camera turns from frame to frame, told from its images alone; where it moves, too, the turn about its axis is hardly concerned by that."""
+"""Rotation of a camera from frame to frame, estimated from its images alone; translation hardly affects the rotation about its axis."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from perch_core import so3
 from perch_core.camera import Camera
 
 CORNERS = 150
-LEAST = 30      # rays in common
+MIN_RAYS = 30   # in common
 ROUNDS = 3      # of fits, each without the rays that are twice as far off as the median
 
 
@@ -46,7 +46,7 @@ class CameraTurns:
             moved, found, _ = cv2.calcOpticalFlowPyrLK(old, grey, corners, None, winSize=(21, 21), maxLevel=4)  # type: ignore[call-overload]
             before, after = (self._camera.unproject(points.reshape(-1, 2).astype(float)) for points in (corners, moved))
             good = (found.ravel() == 1) & np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
-            if good.sum() >= LEAST:
+            if good.sum() >= MIN_RAYS:
                 self.spans.append((then, stamp, so3.log(rotation_between(before[good], after[good])) / (1e-9 * (stamp - then))))
         self._last = stamp, grey, cv2.goodFeaturesToTrack(grey, CORNERS, 0.01, 12)
 

@@ -17,22 +17,22 @@ from perch_eval.flight_view import FlightView
 from perch_eval.margins import limits, margins, number
 from perch_eval.metrics import FIGURES, figures, flight_metrics
 from perch_eval.page import image, page, section, table
-from perch_eval.recorded import opened, report_of, vehicle_of
+from perch_eval.recorded import identify_vehicle, read_flight, read_report
 from perch_eval.scene_3d import scene_3d
 
 COLOURS = ("#1f77b4", "#d95f02")
-SAID = ("outcome", "scenario", "vehicle", "seed", "date", "commit", "digest", "message")  # words of a report
+REPORT_FIELDS = ("outcome", "scenario", "vehicle", "seed", "date", "commit", "digest", "message")  # shown as text
 EXAMPLES = """examples:
   python3 scripts/compare.py out/flight.mcap /tmp/flight/flight.mcap   page compare.html in this folder
   python3 scripts/compare.py before after --out before_after.html      folders of demo.py, with flight.mcap and report.json
   python3 scripts/compare.py two.mcap two.mcap --namespace /quad1 /quad2
 
-exit code: 0 written, 2 the caller's mistake (no such recording, nothing in it)"""
+exit code: 0 written, 2 invalid input (no such recording, nothing in it)"""
 
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two flights: what was recorded, what its `report.json` and the recording say, and whether the vehicle is known."""
+    """One of the two flights: what was recorded, its figures by `report.json` and recording, and whether the vehicle is known."""
 
     view: FlightView
     report: dict[str, Any]
@@ -73,23 +73,23 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
         name, colour: on the page.
         path: of the recording, or of its folder.
         namespace: of the vehicle, where several were recorded.
-        vehicle: name or file; empty: as report or recording say.
+        vehicle: name or file; empty: that of report or recording.
 
     Raises:
         PerchError: no recording, or nothing in it.
     """
     file = path / "flight.mcap" if path.is_dir() else path
-    flight = opened(file, namespace)
+    flight = read_flight(file, namespace)
     flight.known_states("ground_truth/odometry")
-    report = report_of(flight)
-    flew = vehicle_of(flight, report, vehicle)
-    model = flew or load_vehicle("snapdragon")
-    view = FlightView.of(flight, model, name, colour)
+    report = read_report(flight)
+    identified = identify_vehicle(flight, report, vehicle)
+    model = identified or load_vehicle("snapdragon")
+    view = FlightView.from_flight(flight, model, name, colour)
     until = report.get("simulated_time_s") or float(view.truth.t[-1])
     report = {**report, **flight_metrics(flight, until), "flight_hash": report.get("flight_hash") or flight.digest(until)}
     found = {one["name"]: one for one in report.get("margins", ()) if one.get("left") is not None}
-    found |= {one.name: one.mapping() for one in margins(flight, model) if flew is not None}
-    return Side(view, report | {"margins": list(found.values())}, flew is not None)
+    found |= {one.name: one.mapping() for one in margins(flight, model) if identified is not None}
+    return Side(view, report | {"margins": list(found.values())}, identified is not None)
 
 
 def compare(a: Side, b: Side) -> str:
@@ -97,7 +97,7 @@ def compare(a: Side, b: Side) -> str:
     sides, views = (a, b), (a.view, b.view)
     same = a.report["flight_hash"] == b.report["flight_hash"]
     verdict = "The two are the same flight, to the last bit." if same else "The two are different flights."
-    drawn = {"Path, seen from the side": plots.path_figure, "Position and velocity": plots.tracking_figure, "Errors": plots.distance_figure,
+    drawn = {"Path, side view": plots.path_figure, "Position and velocity": plots.tracking_figure, "Errors": plots.distance_figure,
                "Rates and tilt": plots.rates_figure}
     if a.known and b.known:
         drawn["Collective thrust, and its bounds"] = plots.thrust_figure
@@ -109,7 +109,7 @@ def compare(a: Side, b: Side) -> str:
 def _table(sides: Sequence[Side]) -> str:
     a, b = (figures(side.report, math.nan) for side in sides)
     rows = [(key, *(str(side.report.get(key, "-")) for side in sides), "")
-            for key in SAID if any(key in side.report for side in sides)]
+            for key in REPORT_FIELDS if any(key in side.report for side in sides)]
     rows.append(("flight hash", *(side.report["flight_hash"][:16] for side in sides), ""))
     for name, (title, unit, factor) in FIGURES.items():
         one, other = a.get(name), b.get(name)

@@ -16,7 +16,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.jit import uncompiled
 from perch_core.vehicle import load_vehicle
 from perch_eval.arguments import command, command_parser, open_network, output_folder
-from perch_eval.domain import own_domain
+from perch_eval.domain import domain_in_environment
 from perch_eval.flyable import check_flight
 from perch_eval.goal import SUCCESSES
 from perch_eval.nodes import CHAIN_NODES, FAST_NODES, programs, sharing
@@ -80,22 +80,22 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
         firmware.ensured()
     if not 0 <= seed < 2**31:
         raise ConfigError("--seed", str(seed), "is outside [0, 2147483647]")
-    say = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)
-    with own_domain(), _replaced(output_folder(out) / "flight.mcap"):
+    on_line = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)
+    with domain_in_environment(), _replaced(output_folder(out) / "flight.mcap"):
         started = programs(scenario, seed, folder=out / "logs", scenario_source=str(source.resolve()), composed=composed, lockstep=not realtime,
                            record=out / "flight.mcap", hold_for_goal=not realtime)
-        stack = Stack(started, out / "logs", on_line=say)
+        stack = Stack(started, out / "logs", on_line=on_line)
         print(f"{scenario.name}, seed {seed}: starting {len(started)} processes", flush=True)
         with stack:
             from perch_eval.report import build_report  # and with it matplotlib, while the nodes start
-            result = _flown(scenario, stack)
+            result = _fly_stack(scenario, stack)
     return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time,
                         result.start_time)
 
 
 @contextmanager
 def _replaced(recording: Path) -> Iterator[None]:
-    """Put the recording of an earlier flight aside, as this one may end before it records; a caller's mistake puts it back."""
+    """Put the recording of an earlier flight aside, as this one may end before it records; refused input puts it back."""
     aside = recording.with_suffix(".earlier")
     if recording.exists():
         recording.replace(aside)
@@ -109,7 +109,7 @@ def _replaced(recording: Path) -> Iterator[None]:
         aside.unlink(missing_ok=True)
 
 
-def _flown(scenario: Scenario, stack: Stack) -> FlightResult:
+def _fly_stack(scenario: Scenario, stack: Stack) -> FlightResult:
     """Send the goal to a started stack; a flight that breaks off is a result too, its recording is kept."""
     with closing(MissionClient()) as client:
         try:
@@ -118,7 +118,7 @@ def _flown(scenario: Scenario, stack: Stack) -> FlightResult:
             client.linger(0.5)
             return result
         except PerchError as error:
-            if isinstance(error, StackError) and error.callers_mistake:
+            if isinstance(error, StackError) and error.refused_input:
                 raise
             return FlightResult("failed", str(error), client.time, math.nan)
 
@@ -130,7 +130,7 @@ def _demonstrate(args: argparse.Namespace) -> int:
     report = fly(args.scenario, args.seed, args.out, composed, args.realtime, args.verbose, args.vehicle)
     from perch_eval.report import summary
     print(f"outcome: {report['outcome']}")
-    print("".join(f"  {name}: {words}\n" for name, words in summary(report)), end="")
+    print("".join(f"  {name}: {text}\n" for name, text in summary(report)), end="")
     if "unwritten" in report:
         print(f"error: {report['unwritten']}", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""Reserves ROS domains, so that flights and tests on one machine never hear each other."""
+"""Reserves ROS domains, so that flights and tests on one machine do not receive each other's messages."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from pathlib import Path
 import psutil
 
 from perch_core.errors import PerchError
-from perch_core.ros.shared_memory import end_unfinished
+from perch_core.ros.shared_memory import remove_unfinished_segments
 from perch_eval.shared_memory import ports
 
 USABLE = range(43, 102)
 """Up to 101 the ports stay below Linux's ephemeral ones; 42 is the default of `setup.bash`, smaller ones are people's."""
-_given: list[int] = []
-"""The domains that this process was given, in order."""
+_reserved: list[int] = []
+"""The domains that this process has reserved, in order."""
 
 
 @contextlib.contextmanager
 def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None = None) -> Iterator[int]:
-    """A domain id that no other reservation on this machine holds, and in which nobody takes part.
+    """A domain id that no other reservation on this machine holds, and that has no participants.
 
     The kernel gives it back when the process ends, however it ends.
 
@@ -45,16 +45,16 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
                 continue
             if participants(candidate):
                 continue
-            _given.append(candidate)
-            end_unfinished()
+            _reserved.append(candidate)
+            remove_unfinished_segments()
             yield candidate
             return
     raise PerchError(f"every ROS domain is reserved (lock files in {folder}): end another flight or test first")
 
 
 @contextlib.contextmanager
-def own_domain(candidates: Iterable[int] | None = None) -> Iterator[int]:
-    """A `reserved_domain` that is this process's own meanwhile, and that of what it starts."""
+def domain_in_environment(candidates: Iterable[int] | None = None) -> Iterator[int]:
+    """A `reserved_domain` that this process and its children use meanwhile, by `ROS_DOMAIN_ID`."""
     before = os.environ.get("ROS_DOMAIN_ID")
     try:
         with reserved_domain(candidates) as domain:
@@ -78,6 +78,6 @@ def free_domain() -> int:
 
 def _spread() -> list[int]:
     """The usable ids, from another one on in each process (people who choose by hand begin with the small ones), and after the
-    one given last: nodes that have been destroyed stay in the graph for a while."""
-    start = USABLE.index(_given[-1]) + 1 if _given and _given[-1] in USABLE else os.getpid() % len(USABLE)
+    last one: nodes that have been destroyed stay in the graph for a while."""
+    start = USABLE.index(_reserved[-1]) + 1 if _reserved and _reserved[-1] in USABLE else os.getpid() % len(USABLE)
     return [*USABLE[start:], *USABLE[:start]]

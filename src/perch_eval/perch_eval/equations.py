@@ -1,7 +1,7 @@
 """The index of equations: where each equation of both papers is defined, read from the tags in docstrings.
 
 `[defines M:eq15]` stands in the docstring of the one function or class that a reader changes to change the equation; a vehicle
-flies it: it is reached from a node's program by names and imports. Whatever else has to do with the equation carries `[uses M:eq15]`
+uses it: it is reached from a node's program by names and imports. Whatever else has to do with the equation carries `[uses M:eq15]`
 or `[M:eq15]`. A tag may name several: `[P:eq3-7]`, `[M:eq2,12,13]`, `[M:alg1]`; a letter (`[P:eq14h]`) names a row.
 """
 
@@ -23,7 +23,7 @@ EXAMPLES = """examples:
   python3 scripts/equations.py && git diff docs/equations.md         see what has moved
   grep -rnI M:eq15 src                                               see all that has to do with an equation
 
-exit code: 0 written, 1 written, but an equation has not the one definition that flies"""
+exit code: 0 written, 1 written, but an equation has not exactly one definition in use"""
 TITLES = {
     "M": {"eq1": "rigid-body dynamics", "eq2": "geometric control: thrust and moment", "eq3": "piecewise polynomials",
           "eq4": "cost: squared derivative", "eq5": "cost matrix of one segment", "eq6": "derivatives at a time",
@@ -53,11 +53,11 @@ _Key = tuple[str, str]
 
 @dataclass(frozen=True)
 class Place:
-    """A function or class (a module: its name is its file's) whose docstring defines an equation; `flies`: a program reaches it."""
+    """A function or class (a module: its name is its file's) whose docstring defines an equation; `in_use`: a program reaches it."""
 
     file: str
     name: str
-    flies: bool
+    in_use: bool
 
 
 def equations_of(text: str) -> list[_Key]:
@@ -141,8 +141,8 @@ def definitions(root: Path) -> dict[_Key, list[Place]]:
                 if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
                     continue
                 keys = [key for tag in _DEFINITION.findall(ast.get_docstring(node) or "") for key in equations_of(tag)]
-                flies = any(at == name for at, _ in reached) if top is module.tree else (name, getattr(top, "name", "")) in reached
-                place = Place(str(module.path.relative_to(root)), getattr(node, "name", module.path.stem), flies)
+                in_use = any(at == name for at, _ in reached) if top is module.tree else (name, getattr(top, "name", "")) in reached
+                place = Place(str(module.path.relative_to(root)), getattr(node, "name", module.path.stem), in_use)
                 for key in keys:
                     found.setdefault(key, []).append(place)
     return found
@@ -156,9 +156,9 @@ def problems(root: Path) -> list[str]:
             places, what = found.get((paper, eq), []), f"{paper}:{eq} ({title})"
             if len(places) != 1:
                 out.append(f"{what} has {len(places)} definitions: {', '.join(f'{p.file} {p.name}' for p in places) or 'none'}")
-            elif places[0].flies == ((paper, eq) in REASONS):
+            elif places[0].in_use == ((paper, eq) in REASONS):
                 out.append(f"{what} is defined in {places[0].file} {places[0].name}, which " +
-                           ("flies in spite of its reason" if places[0].flies else "no program reaches"))
+                           ("a program reaches although REASONS lists it" if places[0].in_use else "no program reaches"))
     return out + [f"{paper}:{eq} is no equation of the papers" for paper, eq in found if eq not in TITLES[paper]]
 
 
@@ -188,7 +188,7 @@ def page(root: Path) -> str:
 
 
 def main() -> int:
-    """Write docs/equations.md; 1 where it has an equation without the one definition that flies."""
+    """Write docs/equations.md; 1 if an equation has not exactly one definition in use."""
     command_parser("equations.py", __doc__, EXAMPLES).parse_args()
     (root() / "docs" / "equations.md").write_text(page(root()))
     for line in (wrong := problems(root())):

@@ -54,15 +54,15 @@ class TrueMotion(Protocol):
 
 @dataclass(frozen=True)
 class Flight:
-    """A motion as the sensors saw it.
+    """A motion and the sensor data along it.
 
     Attributes:
         motion: the true motion, at any time.
         truth: the true motion at the IMU's stamps.
         readings: of the IMU.
-        mount: the camera as calibrated, what VIO is told.
+        mount: the camera as calibrated, which VIO is given.
         frames: (middle of the exposure [s], stamp [ns], image), in order.
-        told_wrong: by how much position [m] and yaw [rad] are wrong that VIO is told at its start, shape (4,).
+        start_error: errors of the position [m] and yaw [rad] that VIO is given at its start, shape (4,).
         vehicle: name of its file.
     """
 
@@ -71,7 +71,7 @@ class Flight:
     readings: ImuReadings
     mount: CameraMount
     frames: tuple[tuple[float, int, np.ndarray], ...]
-    told_wrong: np.ndarray = field(default_factory=lambda: np.zeros(4))
+    start_error: np.ndarray = field(default_factory=lambda: np.zeros(4))
     vehicle: str = "snapdragon"
 
     def sample(self, k: int) -> ImuSample:
@@ -98,10 +98,10 @@ def fly(scenario: Scenario, seed: int) -> Flight:
         scenario: room, pad and realism; its target must lie straight ahead of the start.
         seed: of everything.
     """
-    return seen(motion_of(scenario, seed), build_scene(scenario, seed), scenario, seed)
+    return sensor_data(motion_of(scenario, seed), build_scene(scenario, seed), scenario, seed)
 
 
-def seen(motion: TrueMotion, scene: Scene, scenario: Scenario, seed: int) -> Flight:
+def sensor_data(motion: TrueMotion, scene: Scene, scenario: Scenario, seed: int) -> Flight:
     """Sensor data of a motion in a scene, as `fly`; of the scenario vehicle and realism count."""
     vehicle = load_vehicle(scenario.vehicle)
     mount, rng = vehicle.mounts["down"], np.random.default_rng([seed, 7])
@@ -113,9 +113,9 @@ def seen(motion: TrueMotion, scene: Scene, scenario: Scenario, seed: int) -> Fli
         poses = motion.sample(middle + np.linspace(-0.5, 0.5, 5) * renderer.exposure.time)
         image = renderer.render(list(zip(poses.p_WB, poses.R_WB)), np.random.default_rng([seed, round(middle * 1e6)]))
         frames.append((float(middle), round((middle + real.stamp_offset) * 1e9), image))
-    # A start is told as well as VIO believes it: a covariance cannot be judged on an error that was never made.
-    told_wrong = np.random.default_rng([seed, 9]).standard_normal(4) * TOLD_SIGMA
-    return Flight(motion, truth, read_imu(truth, true_imu(vehicle.imu, seed), rng), mount, tuple(frames), told_wrong, scenario.vehicle)
+    # The start pose is as accurate as its covariance states: a covariance cannot be judged on an error that was never made.
+    start_error = np.random.default_rng([seed, 9]).standard_normal(4) * TOLD_SIGMA
+    return Flight(motion, truth, read_imu(truth, true_imu(vehicle.imu, seed), rng), mount, tuple(frames), start_error, scenario.vehicle)
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class VioStep:
 
     Attributes:
         time: middle of the exposure [s].
-        result: what VIO said.
+        result: of VIO.
         cost: CPU time of the frame [s].
         error: truth minus estimate of (position, rotation about W's axes, velocity in B), shape (9,); None without a pose.
     """
@@ -136,7 +136,7 @@ class VioStep:
 
 
 class _Frame(CameraImage):
-    """An image that knows the middle of its exposure [s]."""
+    """An image with the middle of its exposure [s]."""
 
     __slots__ = ("middle",)
     middle: float
@@ -171,10 +171,10 @@ class _Vehicle(Component[NoParameters]):
         self.imu(sample)
         arrivals = []
         while self._frames and self._frames[0][0] + self._transport <= at:
-            arrivals.append(self._show(*self._frames.popleft()))
+            arrivals.append(self._emit_frame(*self._frames.popleft()))
         return arrivals
 
-    def _show(self, middle: float, stamp: int, pixels: np.ndarray) -> Arrival:
+    def _emit_frame(self, middle: float, stamp: int, pixels: np.ndarray) -> Arrival:
         frame = optical_frame("down")
         image = _Frame(stamp, frame, pixels.shape[1], pixels.shape[0], "mono8", pixels)
         image.middle = middle
@@ -184,7 +184,7 @@ class _Vehicle(Component[NoParameters]):
 
 
 class _Vio(VioComponent):
-    """Keeps what became of each frame, and what it cost."""
+    """Keeps the result and CPU time of each frame."""
 
     def __init__(self, config: VioComponentConfig) -> None:
         super().__init__(config)
@@ -199,8 +199,8 @@ class _Vio(VioComponent):
         self.frames.append((image.middle, self.result, time.process_time() - clock))
 
 
-class _Repeated(Component[NoParameters]):
-    """VIO's states again, each with its frame."""
+class _ReplayedVio(Component[NoParameters]):
+    """Emits recorded states of VIO, each with its frame."""
 
     config_type = NoParameters
 
@@ -239,7 +239,7 @@ class _Estimator(StateEstimator):
 
 
 def run_vio(flight: Flight, begin: float = 0.0, level_ground: bool = True) -> list[VioStep]:
-    """VIO over a flight; it is switched on at `begin` [s], and told the pose of that moment, as wrong as the flight has it.
+    """VIO over a flight; it is switched on at `begin` [s], and given the pose of that moment with the flight's `start_error`.
 
     Args:
         flight: the sensor data.
@@ -249,7 +249,7 @@ def run_vio(flight: Flight, begin: float = 0.0, level_ground: bool = True) -> li
     standing = flight.motion.sample(np.array([begin])).p_WB[0] - (0.0, 0.0, load_vehicle(flight.vehicle).standing_height)
     vio = _Vio(VioComponentConfig(
         vehicle=flight.vehicle, level_ground=level_ground,
-        start_position=tuple((standing + flight.told_wrong[:3]).tolist()), start_yaw_deg=float(np.degrees(flight.told_wrong[3]))))
+        start_position=tuple((standing + flight.start_error[:3]).tolist()), start_yaw_deg=float(np.degrees(flight.start_error[3]))))
     vehicle = _Vehicle(flight, begin)
     _run(Loop(vehicle, {"vio": vio}, {"vio": Task(0.0)}, {}), vehicle)
     return [VioStep(middle, result, cost, _vio_error(flight, result)) for middle, result, cost in vio.frames]
@@ -279,7 +279,7 @@ class EstimatorTrack:
         errors: truth minus estimate of (p, v, theta, b_g, b_a), shape (n, 15).
         covariances: shape (n, 15, 15).
         nis: of each state of VIO that was used.
-        health: what it told of itself, ten times a second.
+        health: its status, ten times a second.
     """
 
     times: np.ndarray
@@ -294,7 +294,7 @@ def run_estimator(flight: Flight, steps: list[VioStep], latency: float = 0.040, 
     stamps = {middle: stamp for middle, stamp, _ in flight.frames}
     states = {stamps[s.time]: _state(s.result.estimate) for s in steps if s.result.estimate is not None and s.time in stamps}
     estimator, vehicle = _Estimator(begin), _Vehicle(flight, transport=min(TRANSPORT, latency))
-    loop = Loop(vehicle, {"estimator": estimator, "vio": _Repeated(states)}, {"estimator": Task(), "vio": Task(latency)}, {})
+    loop = Loop(vehicle, {"estimator": estimator, "vio": _ReplayedVio(states)}, {"estimator": Task(), "vio": Task(latency)}, {})
     _run(loop, vehicle)
     truth, readings, q = flight.truth, flight.readings, flight.truth.q_WB
     errors = [np.concatenate([truth.p_WB[k] - e.p_WB, truth.v_WB[k] - e.v_WB, attitude_error(q[k], e.q_WB),

@@ -110,7 +110,7 @@ class Flight:
         return np.array([t for t, _ in rows]), np.array([pick(value) for _, value in rows])
 
     def reference(self) -> States | None:
-        """What the controller wanted at each step while it followed a trajectory."""
+        """The controller's reference at each step while it followed a trajectory."""
         found: list[ControlReference] = [value for _, value in self.values("controller/reference")]
         return _states(found, "p", "q", "v", "w")
 

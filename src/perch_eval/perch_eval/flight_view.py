@@ -12,7 +12,7 @@ from perch_core.vehicle import Vehicle
 from perch_eval.flight import Flight, States
 from perch_eval.metrics import perch_window
 
-TRUTH, ESTIMATE, WANTED, LIMIT = "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728"
+TRUTH, ESTIMATE, REFERENCE, LIMIT = "#1f77b4", "#ff7f0e", "#2ca02c", "#d62728"
 PAD = 0.3  # half of the pad's side [m]
 SQUARE = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
 
@@ -25,7 +25,7 @@ class FlightView:
         name, colour: on a page with several flights.
         flight, vehicle: what was recorded, and what flew.
         truth: true states.
-        estimate, reference: estimated and wanted states, where recorded.
+        estimate, reference: estimated and reference states, where recorded.
         pad: true pose of the pad p (3,), R (3, 3), where there is one.
         cables: end points of mapped wires, (n, 2, 3).
         camera: (time [s], image) of the front camera's images.
@@ -46,7 +46,7 @@ class FlightView:
     end: float
 
     @classmethod
-    def of(cls, flight: Flight, vehicle: Vehicle, name: str = "", colour: str = TRUTH) -> FlightView:
+    def from_flight(cls, flight: Flight, vehicle: Vehicle, name: str = "", colour: str = TRUTH) -> FlightView:
         """What a recording holds.
 
         Raises:

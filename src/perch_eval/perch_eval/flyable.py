@@ -13,7 +13,7 @@ from perch_core.tag_board import load_board
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_sim.scenario import Scenario
 
-STEEPEST_VIEW = 80.0
+MAX_VIEW_ANGLE = 80.0
 """Between line of sight and the pad's normal [deg]; beyond, a 0.16 m tag at 1.7 m is 4 px wide."""
 
 
@@ -68,10 +68,10 @@ def _check_view(scenario: Scenario, source: str, vehicle: Vehicle) -> None:
     upper, lower = (math.degrees(math.atan2(ray[2], ray[0])) for ray in rays)
     if not lower <= elevation <= upper:
         raise ConfigError(source, "target.height", f"{scenario.target.height:g} m puts the pad {elevation:.0f} deg above the"
-                          f" horizon of the search hover, outside [{lower:.0f}, {upper:.0f}] deg that the front camera sees")
+                          f" horizon of the search hover, outside [{lower:.0f}, {upper:.0f}] deg of the front camera's view")
     cosine = float(np.clip(-sight @ surface.normal / np.linalg.norm(sight), -1.0, 1.0))
     obliqueness = math.degrees(math.acos(cosine))
-    if obliqueness > STEEPEST_VIEW:
+    if obliqueness > MAX_VIEW_ANGLE:
         raise ConfigError(source, "target.inclination_deg",
                           f"{scenario.target.inclination_deg:g} turns the pad {obliqueness:.0f} deg away from the search hover,"
-                          f" outside [0, {STEEPEST_VIEW:g}] deg in which its tags can be read")
+                          f" outside [0, {MAX_VIEW_ANGLE:g}] deg in which its tags can be read")

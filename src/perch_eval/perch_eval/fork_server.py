@@ -1,4 +1,4 @@
-"""Starts nodes in a tenth of a second: each process is forked from one that has loaded their code. Knows nothing of ROS.
+"""Starts nodes in a tenth of a second: each process is forked from one that has loaded their code. Independent of ROS.
 
 A node's own start takes seconds of processor time for imports and compiled code, campaigns over ROS start thousands. What is forked, by
 the fork server of `multiprocessing`, is a process of its own: its own session, sockets, shared memory, signals and log.
@@ -38,7 +38,7 @@ def start(what: str, arguments: Sequence[str], log: Path, environment: Mapping[s
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["perch_eval.ended_with_caller", preload])
-    process = context.Process(target=_become, args=(what, tuple(arguments), log, dict(environment)))
+    process = context.Process(target=_run_node, args=(what, tuple(arguments), log, dict(environment)))
     try:
         process.start()
     except (OSError, EOFError) as error:
@@ -64,12 +64,12 @@ def session(leader: int) -> list[int]:
     return found
 
 
-def _become(what: str, arguments: tuple[str, ...], log: Path, environment: dict[str, str]) -> None:
-    """Be the node."""
+def _run_node(what: str, arguments: tuple[str, ...], log: Path, environment: dict[str, str]) -> None:
+    """Run the node in the forked process."""
     os.setsid()
     end_with_parent(signal.SIGKILL)
     caller = multiprocessing.parent_process()
-    if caller is not None and not caller.is_alive():  # and the fork server with it, before this process could be told
+    if caller is not None and not caller.is_alive():  # and the fork server with it, before `end_with_parent` took effect
         os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     file, nothing = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), os.open(os.devnull, os.O_RDONLY)

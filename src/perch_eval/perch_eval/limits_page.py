@@ -8,7 +8,7 @@ from perch_core.component import Action, Input, Service, ports
 from perch_core.isolated import WAITING_MAX
 from perch_core.registry import resolved
 from perch_core.ros import topics
-from perch_core.ros.late_service import WAITING
+from perch_core.ros.late_service import QUEUE_SIZE
 from perch_core.values import limits
 from perch_eval.arguments import command_parser
 from perch_eval.evaluation.document import table
@@ -54,7 +54,7 @@ def _topics() -> Iterator[str]:
                 takers.setdefault(topics.topic(channel).channel, {}).setdefault(port.value.__name__, []).append(node)
     yield from ("## Topics", "", *table("topic | value | taken by | bytes | read per second | queue", (
         (f"`{row.channel}`", value, ", ".join(dict.fromkeys(nodes)),
-         f"{row.largest >> 20} Mi" if row.largest >= 1 << 20 else f"{row.largest >> 10} Ki", row.often or "all", row.qos.subscribe.depth)
+         f"{row.size_max >> 20} Mi" if row.size_max >= 1 << 20 else f"{row.size_max >> 10} Ki", row.rate_max or "all", row.qos.subscribe.depth)
         for row in topics.TOPICS for value, nodes in takers.get(row.channel, {}).items())), "")
 
 
@@ -65,7 +65,7 @@ def _requests() -> Iterator[str]:
         taken = [(port._channel, port.request) for port in ports(cls, Service)] + [(port._channel, port.goal) for port in ports(cls, Action)]
         rows += [(f"`{channel}`", value.__name__, node) for channel, value in taken]
     yield from ("## Requests and goals", "",
-                f"At most {WAITING} requests of a service wait, and {WAITING_MAX} plans; more plans are refused. Every request is answered.", "",
+                f"At most {QUEUE_SIZE} requests of a service wait, and {WAITING_MAX} plans; more plans are refused. Every request is answered.", "",
                 *table("service, action | value | node", rows), "")
 
 
@@ -78,7 +78,7 @@ def _values() -> Iterator[str]:
 def _allowed(limit: object) -> str:
     if not isinstance(limit, limits.Limit):
         return str(limit)
-    many = f", up to {limit.most} of them" if limit.most else ""
+    many = f", up to {limit.rows_max} of them" if limit.rows_max else ""
     each = ", each entry" if limit.shape else ""
     return f"{limit}{each}{many}{', NaN: left to the node' if limit.optional else ''}"
 

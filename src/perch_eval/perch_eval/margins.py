@@ -10,7 +10,7 @@ import numpy as np
 
 from perch_core.vehicle import Vehicle
 from perch_eval.flight import Flight
-from perch_eval.metrics import perch_window, thrust_history, touch_of
+from perch_eval.metrics import contact_of, perch_window, thrust_history
 from perch_sim.contact_event import ContactState
 from perch_sim.scenario import Scenario
 
@@ -48,13 +48,13 @@ def number(value: float, sign: str = "") -> str:
 
 
 def limits(margin: dict[str, Any]) -> str:
-    """The limits of a mapped margin in words, without the unit; null, as JSON has it, is no limit."""
+    """The limits of a mapped margin as text, without the unit; null, as JSON has it, is no limit."""
     low, high = (None if limit is None or math.isinf(limit) else number(limit) for limit in (margin["low"], margin["high"]))
     return f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
 
 
-def in_words(margin: dict[str, Any]) -> str:
-    """A mapped margin in words: `0.7 m/s (0.2 to 1 m/s): +0.3 m/s left`."""
+def margin_text(margin: dict[str, Any]) -> str:
+    """A mapped margin as text: `0.7 m/s (0.2 to 1 m/s): +0.3 m/s left`."""
     unit = margin["unit"]
     return f"{number(margin['value'])} {unit} ({limits(margin)} {unit}): {number(margin['left'], '+')} {unit} left"
 
@@ -65,7 +65,7 @@ def margins(flight: Flight, vehicle: Vehicle, scenario: Scenario | None = None) 
     Args:
         flight: what was recorded.
         vehicle: its rotors, and the body rate that a plan may ask for.
-        scenario: what adhesion or gripper hold; without it nothing is said of the contact.
+        scenario: what adhesion or gripper hold; without it the contact is left out.
     """
     return [*_in_flight(flight, vehicle), *(_at_contact(flight, scenario) if scenario is not None else ())]
 
@@ -89,7 +89,7 @@ def _in_flight(flight: Flight, vehicle: Vehicle) -> list[Margin]:
 
 
 def _at_contact(flight: Flight, scenario: Scenario) -> list[Margin]:
-    touch = touch_of(flight)
+    touch = contact_of(flight)
     if touch is None or touch[1].state not in (ContactState.ATTACHED, ContactState.BOUNCED):
         return []
     contact, tilt = touch[1], math.degrees(touch[1].tilt_error)

@@ -80,17 +80,17 @@ def read(path: Path, on_damage: Callable[[str], None] = lambda _: None) -> Itera
     """Messages of a file in the order written: topic, type, time [ns], data.
 
     A cut-off or damaged file is read as far as it goes; a flight that broke off before its first message has no file at all.
-    Checksums are looked at: a decompressor makes something of nearly every damage.
+    Checksums are verified, as a decompressor reports few kinds of damage.
 
     Args:
         path: the file.
-        on_damage: told why a file could not be read to its end.
+        on_damage: receives the reason why a file could not be read to its end.
     """
     for schema, channel, message in _read(path, on_damage):
         yield channel.topic, schema.name if schema else "", message.log_time, message.data
 
 
-def broke_off(path: Path) -> bool:
+def is_truncated(path: Path) -> bool:
     """Whether a file has no end: its writer was killed, the disk was full, or only a part of it was copied.
 
     Raises:
@@ -102,7 +102,7 @@ def broke_off(path: Path) -> bool:
         return file.read() != MCAP0_MAGIC
 
 
-def make_whole(path: Path, copy: Path) -> str:
+def recover(path: Path, copy: Path) -> str:
     """Write what can be read of a file to another one, with an index.
 
     Returns:

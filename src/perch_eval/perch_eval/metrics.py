@@ -42,7 +42,7 @@ def perch_window(flight: Flight) -> tuple[float, float] | None:
     plans = [(begin, begin + order.contact_after) for begin, order in flight.values("trajectory") if order.contact_after is not None]
     if not plans:
         return None
-    touch = touch_of(flight)
+    touch = contact_of(flight)
     contact = math.inf if touch is None else touch[0]
     start, end = math.nan, -math.inf
     for begin, planned in [plan for plan in plans if plan[0] < contact] or plans:
@@ -50,8 +50,8 @@ def perch_window(flight: Flight) -> tuple[float, float] | None:
     return start, min(end, contact) if contact > start else end
 
 
-def touch_of(flight: Flight) -> tuple[float, Contact] | None:
-    """Time and event of the contact that ended the perch: the adhesion, or else the first touch after take-off."""
+def contact_of(flight: Flight) -> tuple[float, Contact] | None:
+    """Time and event of the contact that ended the perch: the adhesion, or else the first contact after take-off."""
     airborne = False
     first = None
     for t, contact in flight.values("contact"):
@@ -66,7 +66,7 @@ def touch_of(flight: Flight) -> tuple[float, Contact] | None:
 
 def contact_report(flight: Flight) -> dict[str, Any] | None:
     """Speeds, tilt and offset at the contact, from the truth."""
-    touch = touch_of(flight)
+    touch = contact_of(flight)
     if touch is None:
         return None
     t, contact = touch
@@ -180,12 +180,12 @@ def rates(flight: Flight) -> dict[str, float]:
 def diagnostics(flight: Flight) -> dict[str, list[dict[str, float]]]:
     """Every diagnostics of each node, in order: their numbers by name."""
     out: dict[str, list[dict[str, float]]] = {}
-    for _, said in flight.values("diagnostics"):
+    for _, message in flight.values("diagnostics"):
         values = {}
-        for key, value in said.values.items():
+        for key, value in message.values.items():
             with suppress(ValueError):
                 values[key] = float(value)
-        out.setdefault(str(said.values.get("node", "")).strip("/"), []).append(values)
+        out.setdefault(str(message.values.get("node", "")).strip("/"), []).append(values)
     return out
 
 

@@ -1,4 +1,4 @@
-"""The nodes `target_localizer` and `powerline_mapper` without images: what they see is made from the truth, by the error models of
+"""The nodes `target_localizer` and `powerline_mapper` without images: their sightings are made from the truth, by the error models of
 flights in process. For campaigns over ROS that do not render.
 
     python3 -m perch_eval.modelled_sight_node target_localizer --ros-args -p scenario:=surface_90 -p seed:=3
@@ -26,18 +26,18 @@ from perch_sim.obstacles import pad_surface
 from perch_sim.scenario import Scenario, load_scenario
 from perch_sim.state_history import StateHistory, TrueState
 
-MEMORY = 1000  # true states kept: 2 s, as images wait for the odometry
+TRUTH_BUFFER = 1000  # true states kept: 2 s, as images wait for the odometry
 
 
 @dataclass(frozen=True)
 class SightParameters(TargetLocalizerConfig):
-    """Those of the localiser, and whose truth it looks at."""
+    """Parameters of the localiser, and the scenario with its true target."""
 
     scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file")
     seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
 
 
-class ModelledLocalizer(TargetLocalizer):
+class TruthLocalizer(TargetLocalizer):
     """The target localiser with its sightings made from the truth: a frame's `camera_info` takes the place of its image."""
 
     config_type = SightParameters
@@ -51,7 +51,7 @@ class ModelledLocalizer(TargetLocalizer):
             ConfigError: no such scenario, vehicle, camera or board.
         """
         scenario = load_scenario(config.scenario)
-        self._truth, self._newest = StateHistory(MEMORY), 0
+        self._truth, self._newest = StateHistory(TRUTH_BUFFER), 0
         self._sight = ModelledSight(config, scenario, config.seed, self._truth, lambda: pad_surface(scenario, (self._newest - START) * 1e-9))
         super().__init__(config, self._sight)
 
@@ -75,13 +75,13 @@ class ModelledLocalizer(TargetLocalizer):
         return super().covers(image) and self._sight.middle(self._exposed(image)) <= self._newest
 
 
-TARGET_LOCALIZER = node("target_localizer", ModelledLocalizer)
+TARGET_LOCALIZER = node("target_localizer", TruthLocalizer)
 POWERLINE_MAPPER = node("powerline_mapper", MappedWorld)
 NODES = {one.name: one for one in (TARGET_LOCALIZER, POWERLINE_MAPPER)}
 MODULE = "perch_eval.modelled_sight_node"
 
 
-def blind_launches(scenario: Scenario, seed: int, source: str, lockstep: bool, extra: Sequence[str] = (), **options: Any
+def imageless_launches(scenario: Scenario, seed: int, source: str, lockstep: bool, extra: Sequence[str] = (), **options: Any
                    ) -> tuple[NodeLaunch, ...]:
     """The nodes that fly a scenario without images, with their parameters.
 
@@ -98,8 +98,8 @@ def blind_launches(scenario: Scenario, seed: int, source: str, lockstep: bool, e
     return tuple(NodeLaunch(one.name, changed.get(one.name, dict)(one.parameters), one.host) for one in launches)
 
 
-def blind_programs(programs: Sequence[Program]) -> tuple[Program, ...]:
-    """Programs whose nodes that look at images are those of this module."""
+def imageless_programs(programs: Sequence[Program]) -> tuple[Program, ...]:
+    """Programs in which the nodes that use images are replaced by those of this module."""
     return tuple(Program(one.name, (sys.executable, "-m", MODULE, one.name, *one.command[1:]), one.nodes) if one.name in NODES else one
                  for one in programs)
 

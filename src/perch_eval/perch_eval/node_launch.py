@@ -23,9 +23,9 @@ PARTICIPANTS = frozenset(flight_tasks(Latency()))
 """Nodes that take part in the simulator's lockstep."""
 ALWAYS = ("description",)
 """Nodes that are started with every scenario."""
-PATIENT = 60.0  # wall-clock limit of a plan for which simulation time waits [s]
+LOCKSTEP_PLAN_TIMEOUT = 60.0  # wall-clock limit of a plan for which simulation time waits [s]
 HOST_PARAMETERS = ("lockstep", "lockstep_hold", "use_sim_time")
-"""Parameters of a node that its component knows nothing of."""
+"""Parameters of a node's host, which its component does not have."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,11 @@ def choose_nodes(scenario: Scenario, only: Sequence[str] = (), without: Sequence
     for node in (*only, *without, *extra):
         if node not in NODES:
             raise PerchError(f"node {node!r} is not one of {', '.join(NODES)}")
-    everyone = tuple(dict.fromkeys((*(only or (*scenario.nodes, *ALWAYS)), *extra)))
+    available = tuple(dict.fromkeys((*(only or (*scenario.nodes, *ALWAYS)), *extra)))
     for node in without:
-        if node not in everyone:
-            raise PerchError(f"node {node!r} is not started anyway; started: {', '.join(everyone)}")
-    chosen = tuple(node for node in everyone if node not in without)
+        if node not in available:
+            raise PerchError(f"node {node!r} is not started anyway; started: {', '.join(available)}")
+    chosen = tuple(node for node in available if node not in without)
     if not chosen:
         raise PerchError("no node is left to start")
     return chosen
@@ -95,7 +95,7 @@ def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, sc
         nodes: what to start.
         seed: of every random number in the flight.
         scenario_source: name or file of the scenario, for the nodes that read it themselves.
-        lockstep: simulation time waits for all who take part; otherwise the wall clock paces it.
+        lockstep: simulation time waits for all participants; otherwise the wall clock paces it.
         overrides: node -> parameter -> value, over everything else.
 
     Raises:
@@ -178,7 +178,8 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
     mission: dict[str, Any] = {"mission.planner_latency": scenario.latency.perching_planner,
                "mission.powerline_latency": scenario.latency.powerline_planner}
     controller: dict[str, Any] = dict(vehicle)
-    planner = vehicle | ({"time_limit": PATIENT} if lockstep else {})  # simulation time waits: what is flown depends on no processor
+    # in lockstep simulation time waits: what is flown depends on no processor
+    planner = vehicle | ({"time_limit": LOCKSTEP_PLAN_TIMEOUT} if lockstep else {})
     if scenario.mode == "inspection":
         mission |= {"mission.waypoints": [v for w in scenario.inspection.waypoints for v in (*w.position, w.yaw_deg)],
                     "mission.inspection_speed": scenario.inspection.speed}
@@ -187,7 +188,7 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
         "viewer": {"scenario": source}, "description": vehicle,
         "vehicle": vehicle | {"scenario": source, "seed": seed, "participants": participants or [""]},
         "vio": vehicle | {"start_position": list(scenario.start.position), "start_yaw_deg": scenario.start.yaw_deg},
-        # in lockstep the schedule lets what it says count later
+        # in lockstep the schedule delays its outputs
         "vio_model": vehicle | {"seed": seed, "latency": 0.0 if lockstep else scenario.latency.vio}, "powerline_mapper": vehicle,
         "target_localizer": vehicle | {"board": scenario.target.board},
         "perching_planner": planner, "powerline_planner": vehicle, "controller": controller, "mission": mission,

@@ -15,7 +15,7 @@ from perch_sim.scenario import NODES, Scenario
 
 ALL_NODES = tuple(NODES)
 CHAIN_NODES = ("vehicle", "estimator", "controller", "description")
-"""Nodes that every step waits for, and one that says where the vehicle is: in real time they share a process, and nobody else does."""
+"""Nodes that every step waits for, and `description`: in real time they, and no others, share a process."""
 FAST_NODES = (*CHAIN_NODES, "mission", "recorder")
 """Nodes with a little to do at many steps: between processes their messages cost more than their work."""
 PER_VEHICLE = ("/clock", "/tf", "/tf_static")
@@ -37,7 +37,7 @@ def programs(scenario: Scenario, seed: int = 1, *, folder: Path, scenario_source
         folder: receives the parameter files.
         scenario_source: file of the scenario, where it is none of `config/scenarios`.
         composed: nodes that share a process, as far as the scenario has them; the others have one each.
-        lockstep: simulation time waits for all who take part; otherwise the wall clock paces it.
+        lockstep: simulation time waits for all participants; otherwise the wall clock paces it.
         record: add a recorder that writes this MCAP file.
         hold_for_goal: let simulation time begin when the mission has a goal.
         overrides: of other nodes, node -> parameter -> value, over everything else.

@@ -11,8 +11,8 @@ from matplotlib.lines import Line2D
 
 from perch_core import so3
 from perch_eval.flight import States
-from perch_eval.flight_view import ESTIMATE, LIMIT, PAD, TRUTH, WANTED, FlightView
-from perch_eval.metrics import thrust_history, tilt_degrees, touch_of
+from perch_eval.flight_view import ESTIMATE, LIMIT, PAD, REFERENCE, TRUTH, FlightView
+from perch_eval.metrics import contact_of, thrust_history, tilt_degrees
 
 RUNNING = 1  # state in perch_msgs/EstimatorStatus
 ARROW = 0.2  # length of a thrust direction [m]
@@ -48,8 +48,8 @@ def panels(views: Views, content: Sequence[Panel], columns: int, height: float =
         span: times that are shown [s]; None: around the perch.
     """
     alone, rows = len(views) == 1, -(-len(content) // columns)
-    low, high = span or (min(view.start - _zero(views, view) for view in views) - BEFORE,
-                         max(view.end - _zero(views, view) for view in views) + AFTER)
+    low, high = span or (min(view.start - _time_offset(views, view) for view in views) - BEFORE,
+                         max(view.end - _time_offset(views, view) for view in views) + AFTER)
     figure = Figure(figsize=(12, height * rows), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for axis, (label, lines) in zip(grid.flat, content):
@@ -70,7 +70,7 @@ def panels(views: Views, content: Sequence[Panel], columns: int, height: float =
     return figure
 
 
-def _zero(views: Views, view: FlightView) -> float:
+def _time_offset(views: Views, view: FlightView) -> float:
     """Time of a flight that is called 0 s [s]."""
     return 0.0 if len(views) == 1 else view.start
 
@@ -79,7 +79,7 @@ def _marks(views: Views) -> list[tuple[float, str, str, str]]:
     """Time [s], colour, style and label of vertical lines: the perch begins, and the contact; of several flights the end of each."""
     if len(views) > 1:
         return [(view.end - view.start, view.colour, ":", "") for view in views]
-    touch = touch_of(views[0].flight)
+    touch = contact_of(views[0].flight)
     return [(views[0].start, "0.7", "-", "perch begins"), *([(touch[0], "k", "-.", "contact")] if touch is not None else [])]
 
 
@@ -88,7 +88,7 @@ def _states(views: Views, pick: Callable[[States], np.ndarray], estimate: bool =
     if len(views) > 1:
         return [Line(view.truth.t - view.start, pick(view.truth), view.colour, view.name) for view in views]
     view = views[0]
-    kinds = [(view.reference, WANTED, "reference", "-"), (view.truth, TRUTH, "truth", "-"), (view.estimate, ESTIMATE, "estimate", "--")]
+    kinds = [(view.reference, REFERENCE, "reference", "-"), (view.truth, TRUTH, "truth", "-"), (view.estimate, ESTIMATE, "estimate", "--")]
     return [Line(states.t, pick(states), colour, label, style) for states, colour, label, style in kinds[:3 if estimate else 2]
             if states is not None]
 
@@ -107,7 +107,7 @@ def rates_figure(*views: FlightView) -> Figure:
     def content(axis: int) -> Panel:
         return f"rate {'xyz'[axis]} [deg/s]", _states(views, lambda states: np.degrees(states.w[:, axis]), estimate=False)
 
-    tilts = [Line(view.truth.t - _zero(views, view), tilt_degrees(view.truth.q), view.colour) for view in views]
+    tilts = [Line(view.truth.t - _time_offset(views, view), tilt_degrees(view.truth.q), view.colour) for view in views]
     return panels(views, [*map(content, range(3)), ("tilt of b3 [deg]", tilts)], 2)
 
 
@@ -118,12 +118,12 @@ def thrust_figure(*views: FlightView) -> Figure:
     for view in views:
         t, *thrusts = thrust_history(view.flight, view.vehicle)
         for lines, thrust in zip((reached, commanded), thrusts):
-            lines.append(Line(t - _zero(views, view), thrust, view.colour, view.name))
+            lines.append(Line(t - _time_offset(views, view), thrust, view.colour, view.name))
     bounds = sorted({4 * bound for view in views for bound in (view.vehicle.thrust_min, view.vehicle.thrust_max)})
     if len(views) > 1:
         return panels(views, [("reached [N]", reached), ("commanded [N]", commanded)], 2, bounds=bounds)
-    t, wanted = views[0].flight.vectors("controller/reference", lambda r: r.thrust)
-    lines = [Line(t, wanted, WANTED, "reference"),
+    t, reference = views[0].flight.vectors("controller/reference", lambda r: r.thrust)
+    lines = [Line(t, reference, REFERENCE, "reference"),
              commanded[0]._replace(colour=ESTIMATE, label="commanded to the rotors (leads the lag)", width=0.9),
              reached[0]._replace(label="reached")]
     return panels(views, [("thrust [N]", lines)], 1, 2.8, bounds)
@@ -135,7 +135,7 @@ def error_figure(view: FlightView) -> Figure | None:
     if estimate is None:
         return None
     running = [t for t, health in view.flight.values("estimator/status") if health.state == RUNNING]
-    began = running[0] if running else estimate.t[0]  # before, the filter knows nothing: kilometres of sigma
+    began = running[0] if running else estimate.t[0]  # before, sigma is kilometres
     shown = [(t, state) for t, state in view.flight.values("odometry") if t >= began][::10]
     sigma = np.array([np.sqrt(np.maximum(0.0, state.pose_covariance.diagonal()[:3])) for _, state in shown])
     t, error = np.array([t for t, _ in shown]), estimate.p - view.truth.at(estimate.t).p
@@ -153,7 +153,8 @@ def distance_figure(*views: FlightView) -> Figure:
             states: States | None = getattr(view, kind)
             if states is not None:
                 t = states.t[inside := (states.t >= view.start) & (states.t <= view.end)]
-                found.append(Line(t - _zero(views, view), 100.0 * np.linalg.norm(states.p[inside] - view.truth.at(t).p, axis=1), view.colour, view.name))
+                distance = 100.0 * np.linalg.norm(states.p[inside] - view.truth.at(t).p, axis=1)
+                found.append(Line(t - _time_offset(views, view), distance, view.colour, view.name))
         return found
 
     return panels(views, [(f"{kind} - truth [cm]", lines(kind)) for kind in ("reference", "estimate")], 2)
@@ -164,11 +165,12 @@ def path_figure(*views: FlightView) -> Figure:
     figure = Figure(figsize=(12, 5), layout="constrained")
     axis = figure.subplots()
     along = _horizontal(views[0])
-    for ends, colour, label in _of_each(views, "pad", _pad_from_side):
+    for ends, colour, label in _segments(views, "pad", _pad_from_side):
         axis.plot(ends[:, :2] @ along, ends[:, 2], color=colour, lw=5, solid_capstyle="butt", label=label)
     for view in views:
-        wanted, name = (WANTED, "") if len(views) == 1 else (view.colour, f"{view.name}, ")
-        for states, colour, width, label in ((view.reference, wanted, 1.0, f"{name}reference"), (view.truth, view.colour, 1.6, f"{name}truth")):
+        reference_colour, name = (REFERENCE, "") if len(views) == 1 else (view.colour, f"{view.name}, ")
+        for states, colour, width, label in ((view.reference, reference_colour, 1.0, f"{name}reference"),
+                                             (view.truth, view.colour, 1.6, f"{name}truth")):
             if states is not None:
                 keep = (states.t >= view.start - BEFORE) & (states.t <= view.end + 0.3)
                 axis.plot(states.p[keep, :2] @ along, states.p[keep, 2], color=colour, lw=width, label=label)
@@ -178,7 +180,7 @@ def path_figure(*views: FlightView) -> Figure:
                     color=ESTIMATE if len(views) == 1 else view.colour, label=f"{name}b3")
         axis.update_datalim(np.stack([(p + b3)[:, :2] @ along, (p + b3)[:, 2]], axis=1))
     axis.set_aspect("equal", adjustable="datalim")
-    for ends, colour, label in _of_each(views, "cable", lambda view: view.cables):  # drawn as far as the path is shown
+    for ends, colour, label in _segments(views, "cable", lambda view: view.cables):  # drawn as far as the path is shown
         axis.add_artist(Line2D(ends[:, :2] @ along, ends[:, 2], color=colour, marker="o", ms=5, label=label))
     axis.set(xlabel="along the perch [m]", ylabel="z [m]")
     axis.grid(alpha=0.3)
@@ -194,14 +196,14 @@ def _pad_from_side(view: FlightView) -> np.ndarray:
     return np.array([[c - PAD * R[:, 0], c + PAD * R[:, 0]]])
 
 
-def _of_each(views: Views, kind: str, segments: Callable[[FlightView], np.ndarray]) -> list[tuple[np.ndarray, str, str]]:
+def _segments(views: Views, kind: str, segments: Callable[[FlightView], np.ndarray]) -> list[tuple[np.ndarray, str, str]]:
     """End points (2, 3) [m], colour and label of what stands at the flights' places: black where it is the same for all of them."""
     found = [segments(view) for view in views]
     if all(np.array_equal(found[0], other) for other in found):
-        looks = [("k", kind)]
+        styles = [("k", kind)]
     else:
-        looks = [(view.colour, f"{view.name}, {kind}") for view in views]
-    return [(ends, colour, "" if k else label) for several, (colour, label) in zip(found, looks) for k, ends in enumerate(several)]
+        styles = [(view.colour, f"{view.name}, {kind}") for view in views]
+    return [(ends, colour, "" if k else label) for several, (colour, label) in zip(found, styles) for k, ends in enumerate(several)]
 
 
 def _horizontal(view: FlightView) -> np.ndarray:

@@ -50,12 +50,12 @@ class Ending:
     def __str__(self) -> str:
         reason = f"exit code {self.code}" if self.code >= 0 else f"killed by {signal.Signals(-self.code).name}"
         lines = "".join(f"\n    {line}" for line in self.tail)
-        last = f". Its last lines ({self.log}):{lines}" if lines else f" without a word ({self.log})"
+        last = f". Its last lines ({self.log}):{lines}" if lines else f" without output ({self.log})"
         return f"{self.name} ended: {reason}{last}"
 
 
 class RunningProgram:
-    """A started program. It dies with the process (strictly: the thread) that started it.
+    """A started program. It ends with the process (strictly: the thread) that started it.
 
     It gets a process group of its own, so that Ctrl-C does not reach it from the terminal, but stays in the session: Linux
     shares processors between sessions first (autogroups), and in one of its own its niceness would mean nothing to others.
@@ -74,7 +74,7 @@ class RunningProgram:
         self._tail: deque[str] = deque(maxlen=_TAIL)
         self._read_lines = 0
         self._process = subprocess.Popen(
-            [*_die_with_parent(), *program.command], env=dict(environment), process_group=0,
+            [*_terminate_with_parent(), *program.command], env=dict(environment), process_group=0,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
         self._reader = threading.Thread(target=self._read, name=f"log {program.name}", daemon=True)
         self._reader.start()
@@ -105,7 +105,7 @@ class RunningProgram:
     def ending(self) -> Ending:
         """How it ended. Waits for the end."""
         code = self._process.wait()
-        while self._reader.is_alive():  # to its last words; a grandchild may hold the pipe open, and is not waited for
+        while self._reader.is_alive():  # until its output is read; a grandchild may hold the pipe open, and is not waited for
             read = self._read_lines
             self._reader.join(1.0)
             if self._read_lines == read:
@@ -113,7 +113,7 @@ class RunningProgram:
         return Ending(self.program.name, code, tuple(self._tail), self._log)
 
     def _read(self) -> None:
-        """Take everything that it writes, whatever becomes of the log: a program whose pipe is full waits, one whose pipe is closed dies."""
+        """Read all output, even if the log cannot be written: a program whose pipe is full waits, one whose pipe is closed ends."""
         assert self._process.stdout is not None
         with self._process.stdout as stream, ExitStack() as stack:
             file = None
@@ -128,7 +128,7 @@ class RunningProgram:
                 self._on_line(self.program.name, line.rstrip())
 
 
-def _die_with_parent() -> tuple[str, ...]:
+def _terminate_with_parent() -> tuple[str, ...]:
     """A prefix under which the kernel ends the program when its parent is killed, where the system has it."""
     setpriv = shutil.which("setpriv")
     return (setpriv, "--pdeathsig", "TERM", "--") if setpriv else ()

@@ -15,7 +15,7 @@ from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.ros.recorded_flight import RecordedFlight
 
 
-def opened(path: Path, namespace: str = "") -> RecordedFlight:
+def read_flight(path: Path, namespace: str = "") -> RecordedFlight:
     """The flight of a file; one that is cut off or damaged is read as far as it goes, with a warning.
 
     Raises:
@@ -29,8 +29,8 @@ def opened(path: Path, namespace: str = "") -> RecordedFlight:
     return flight
 
 
-def report_of(flight: RecordedFlight) -> dict[str, Any]:
-    """What `report.json` beside the recording says; nothing where there is none, or, with a warning, that of another flight.
+def read_report(flight: RecordedFlight) -> dict[str, Any]:
+    """Content of `report.json` beside the recording; empty where there is none, or, with a warning, that of another flight.
 
     Raises:
         PerchError: it is no report.
@@ -50,8 +50,8 @@ def report_of(flight: RecordedFlight) -> dict[str, Any]:
     return report
 
 
-def vehicle_of(flight: RecordedFlight, report: dict[str, Any], given: str = "") -> Vehicle | None:
-    """The vehicle that flew: as it is given, as the report says, or that of `robot_description`; None, with a warning: nobody tells.
+def identify_vehicle(flight: RecordedFlight, report: dict[str, Any], given: str = "") -> Vehicle | None:
+    """The vehicle that flew: the given one, that of the report, or that of `robot_description`; None, with a warning: it is not known.
 
     Raises:
         ConfigError: the one that is given is none.

@@ -18,14 +18,14 @@ from perch_eval import plots
 from perch_eval.camera_clip import clip
 from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
-from perch_eval.identification.answers import inner_loop_figure
+from perch_eval.identification.responses import inner_loop_figure
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import Inspected, recorded
-from perch_eval.margins import in_words, margins
+from perch_eval.margins import margin_text, margins
 from perch_eval.metrics import DURATION, diagnostics, flight_metrics, missed_deadlines, node_durations, rates
 from perch_eval.goal import SUCCESSES
 from perch_eval.page import Html, image, page, section, table, text
-from perch_eval.revision import made_of
+from perch_eval.revision import code_version
 from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.scene_3d import scene_3d
 from perch_sim.scenario import Scenario
@@ -40,7 +40,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         scenario: what was flown.
         seed: its seed.
         outcome: `perched`, or how it failed (lower-case name of the action's error code).
-        message: the mission's own words.
+        message: of the mission.
         wall_time: wall-clock duration of the flight [s].
         end_time: simulation time at which the goal ended [s].
         start_time: simulation time at which it was sent [s]; None: the recording begins with it.
@@ -55,7 +55,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         start_time = first[0][0] if first else end_time
     report: dict[str, Any] = {
         "outcome": outcome, "message": message, "scenario": scenario.name, "vehicle": scenario.vehicle, "seed": seed,
-        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", **made_of(),
+        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", **code_version(),
         "simulated_time_s": end_time, "simulated_duration_s": end_time - start_time, "wall_time_s": wall_time,
         "real_time_factor": (end_time - start_time) / wall_time if wall_time > 0 else math.nan,
         **flight_metrics(flight, end_time),
@@ -105,13 +105,13 @@ def _timeline(flight: Flight) -> list[tuple[float, str]]:
 
 
 def last_diagnostics(flight: Flight) -> list[tuple[str, str]]:
-    """What each node said last of itself, in words, without its durations: `node_durations` has those of the whole flight."""
+    """The last diagnostics of each node as text, without its durations: `node_durations` has those of the whole flight."""
     return [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items() if not DURATION.search(k)))
             for node, reports in diagnostics(flight).items()]
 
 
 def _with_unit(key: str, value: float) -> str:
-    """A figure of a node's diagnostics, whose unit is a part of its name, in words."""
+    """A figure of a node's diagnostics, whose unit is a part of its name, as text."""
     unit = _UNIT.search(key)
     return f"{_UNIT.sub('', key).replace('_', ' ')} {value:.4g}{f' {UNITS[unit[1]]}' if unit else ''}"
 
@@ -140,7 +140,7 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
     for kind in ("tracking", "estimation"):
         share = report.get(f"{kind}_judged", 1.0)
         rows.append((f"{kind} RMSE x, y, z", _centimetres(report.get(f"{kind}_rmse_m")) +
-                     (f" (known in {100 * share:.0f} % of the time)" if share < 0.99 else "")))
+                     (f" (available in {100 * share:.0f} % of the time)" if share < 0.99 else "")))
     return [*rows,
             ("largest body rate", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
             ("largest acceleration", f"{report.get('max_acceleration_m_s2', math.nan):.1f} m/s^2"),
@@ -157,7 +157,7 @@ def _figures(view: FlightView | None, inspection: Inspected | None) -> list[tupl
                     ("Clearance, reprojection error and visibility of the watched line", metrics_figure(inspection))]
     if view is not None:
         figures += [("Tracking and estimation through the perch", plots.tracking_figure(view)),
-                    ("Path, seen from the side", plots.path_figure(view)), ("Body rates and tilt", plots.rates_figure(view)),
+                    ("Path, side view", plots.path_figure(view)), ("Body rates and tilt", plots.rates_figure(view)),
                     ("Thrust against its bounds", plots.thrust_figure(view)),
                     ("The inner loop: commanded, measured, and by the vehicle file's model", inner_loop_figure(view.flight, view.vehicle)),
                     ("Estimation error over the flight", plots.error_figure(view))]
@@ -168,18 +168,18 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
     title = f"{scenario.name}, seed {report['seed']}"
     view = None
     with suppress(PerchError):
-        view = FlightView.of(flight, vehicle, scenario.name)
+        view = FlightView.from_flight(flight, vehicle, scenario.name)
     good = "good" if report["outcome"] in SUCCESSES else "bad"
     timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
                for node, values in report["timings_ms"].items()]
-    kept = [(m["name"], in_words(m)) for m in report["margins"]]
+    margin_rows = [(m["name"], margin_text(m)) for m in report["margins"]]
     flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("seed", report["seed"]), ("date", report["date"]),
              ("commit", report["commit"] + (f" (digest {report['digest']})" if report["digest"] else ""))]
     return page(
-        title, table([*flown, *summary(report)]), section("Margins", table(kept), "No perch was planned."),
-        section("Timeline", table((f"{t:.3f} s", words) for t, words in _timeline(flight))),
+        title, table([*flown, *summary(report)]), section("Margins", table(margin_rows), "No perch was planned."),
+        section("Timeline", table((f"{t:.3f} s", event) for t, event in _timeline(flight))),
         section("Flight in 3-D", scene_3d([view]) if view is not None else "", "not recorded"),
-        section("What the cameras saw", clip(flight), "No images were recorded."),
+        section("Camera images", clip(flight), "No images were recorded."),
         *(section(name, image(figure, name)) for name, figure in _figures(view, inspection)),
         section("Rates", table((topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())),
         section("Times that the nodes measured", table(timings)), section("Diagnostics of the last second", table(last_diagnostics(flight))),

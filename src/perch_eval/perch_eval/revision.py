@@ -43,7 +43,7 @@ def without_docstrings(source: bytes) -> bytes:
 def digest() -> str:
     """SHA-256 over all files of `CODE` that git tracks, as they are in the working tree, 12 digits; empty outside a repository.
 
-    Docstrings do not count: who improves their words need not fly again.
+    Docstrings do not count, so that results remain valid when these are edited.
     """
     total = hashlib.sha256()
     names = _git("ls-files", *CODE).splitlines()
@@ -54,8 +54,8 @@ def digest() -> str:
     return total.hexdigest()[:12] if names else ""
 
 
-def made_of() -> dict[str, str]:
-    """The first entries of a file of results: which code they are of."""
+def code_version() -> dict[str, str]:
+    """Commit and digest of the code, the first entries of a file of results."""
     return {"commit": commit(), "digest": digest()}
 
 
@@ -64,12 +64,12 @@ def banner(commits: Collection[str], codes: Collection[str]) -> str:
 
     Args:
         commits: as `commit()` gave them when the results were made.
-        codes: as `digest()` gave them; empty words where that is not known.
+        codes: as `digest()` gave them; empty texts where that is not known.
     """
     now, several = digest(), "s" * (len(set(commits)) > 1)
-    of = f"** (digest {now})" if now and set(codes) == {now} else f"{OLDER}**"
+    status = f"** (digest {now})" if now and set(codes) == {now} else f"{OLDER}**"
     first = min(commits, default="").partition("+")[0]
-    return f"> **Of commit{several} {', '.join(sorted(set(commits)))}{of}. What has changed since: `git diff --stat {first} -- {' '.join(CODE)}`"
+    return f"> **Of commit{several} {', '.join(sorted(set(commits)))}{status}. What has changed since: `git diff --stat {first} -- {' '.join(CODE)}`"
 
 
 def out_of_date(page: str, now: str) -> bool:

@@ -38,9 +38,9 @@ def _flight(view: FlightView, zero: float) -> dict[str, Any]:
     start, end = view.around(BEFORE, AFTER)
     times = np.arange(start, end + 0.5 * PERIOD, PERIOD)
     states, reference = view.truth.at(times), view.reference
-    wanted = np.empty((0, 3)) if reference is None else reference.p[(reference.t >= start) & (reference.t <= end)][::2]
+    reference_path = np.empty((0, 3)) if reference is None else reference.p[(reference.t >= start) & (reference.t <= end)][::2]
     return {"colour": view.colour, "t": _rounded(times - zero), "p": _rounded(states.p), "q": _rounded(states.q, 4),
-            "rotors": _rounded(view.vehicle.rotor_xy), "reference": _rounded(wanted), "cables": _rounded(view.cables),
+            "rotors": _rounded(view.vehicle.rotor_xy), "reference": _rounded(reference_path), "cables": _rounded(view.cables),
             "pad": [] if view.pad_corners is None else _rounded(view.pad_corners)}
 
 

@@ -19,7 +19,7 @@ from perch_control.mission.parameters import MissionParameters
 from perch_control.mission_component import RUNNING
 from perch_control.modes import Command, State
 from perch_core import config, so3
-from perch_core.component import Component, Input, Output, Wake
+from perch_core.component import Component, Input, Output, Timer
 from perch_core.errors import PerchError
 from perch_core.extends import extended_mapping
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
@@ -32,7 +32,7 @@ from perch_sim.scenario import Scenario
 
 LEAD = 0.04           # from an order to its start [s]
 TAKE_OFF_SPEED = 0.8  # mean [m/s]
-PATIENCE = 11.0       # until the estimator is ready, in simulated time [s]
+READY_TIMEOUT = 11.0  # until the estimator is ready, in simulated time [s]
 EVERY_STEP = {"controller.reference_period": 0.002}
 """Parameter of the controller: its reference is judged at every step."""
 
@@ -48,10 +48,10 @@ class ScriptedMission(Component[MissionParameters]):
     vehicle. Works at every step, before the controller.
 
     Attributes:
-        status: of the controller, as it last told.
-        believed: newest odometry.
+        status: newest status of the controller.
+        latest_odometry: newest odometry.
         estimator: newest health.
-        wanted: where the controller last wanted to be [m], shape (3,).
+        reference_position: newest reference of the controller [m], shape (3,).
         contact_due: when the perch that was ordered meets the surface [s]; inf: none was.
     """
 
@@ -64,9 +64,9 @@ class ScriptedMission(Component[MissionParameters]):
     estimator_status = Input(EstimatorHealth, "estimator/status")
     trajectory = Output(TrajectoryOrder, "trajectory")
     command = Output(ControllerCommand, "controller/command")
-    check_contact = Wake(0.02)
+    check_contact = Timer(0.02)
 
-    believed: OdometryState
+    latest_odometry: OdometryState
 
     def __init__(self, config: MissionParameters) -> None:
         super().__init__(config)
@@ -76,7 +76,7 @@ class ScriptedMission(Component[MissionParameters]):
         self._target: Target | None = None
         self.status: ControllerStatus | None = None
         self.estimator: EstimatorHealth | None = None
-        self.wanted = np.zeros(3)
+        self.reference_position = np.zeros(3)
         self.contact_due = np.inf
 
     def on_imu(self, sample: ImuSample) -> None:
@@ -84,24 +84,24 @@ class ScriptedMission(Component[MissionParameters]):
         self._forces.append(sample.f_B)
 
     def on_odometry(self, state: OdometryState) -> None:
-        """Where the vehicle believes to be."""
-        self.believed = state
+        """Keep the newest odometry."""
+        self.latest_odometry = state
 
     def on_controller_status(self, status: ControllerStatus) -> None:
-        """What it does."""
+        """Keep the newest status of the controller."""
         self.status = status
 
     def on_reference(self, reference: ControlReference) -> None:
-        """Where it wants to be."""
-        self.wanted = np.array(reference.p)
+        """Keep the newest reference of the controller."""
+        self.reference_position = np.array(reference.p)
 
     def on_estimator_status(self, health: EstimatorHealth) -> None:
-        """Whether it is ready."""
+        """Keep the newest health of the estimator."""
         self.estimator = health
 
     @property
     def state(self) -> State:
-        """Of the controller, as it last told."""
+        """Newest state of the controller."""
         return State.DISARMED if self.status is None else State(self.status.state)
 
     @property
@@ -112,21 +112,21 @@ class ScriptedMission(Component[MissionParameters]):
     @property
     def time(self) -> float:
         """Of the newest odometry [s]."""
-        return seconds(self.believed.stamp)
+        return seconds(self.latest_odometry.stamp)
 
     @property
     def p_WB(self) -> np.ndarray:
-        """Where the vehicle believes to be [m], shape (3,)."""
-        return np.array(self.believed.p_WB)
+        """Estimated position [m], shape (3,)."""
+        return np.array(self.latest_odometry.p_WB)
 
     @property
     def resting(self) -> bool:
         """Whether it hovers without moving."""
-        return self.state is State.HOVERING and float(np.linalg.norm(self.believed.v_B)) < self.config.mission.settle_speed
+        return self.state is State.HOVERING and float(np.linalg.norm(self.latest_odometry.v_B)) < self.config.mission.settle_speed
 
     def order(self, command: Command, reason: str) -> None:
         """Command the controller."""
-        self.command(ControllerCommand(self.believed.stamp, int(command), reason))
+        self.command(ControllerCommand(self.latest_odometry.stamp, int(command), reason))
 
     def follow(self, trajectory: FlatTrajectory, at_end: AtEnd = AtEnd.HOLD) -> int:
         """Order a trajectory; its number."""
@@ -134,9 +134,9 @@ class ScriptedMission(Component[MissionParameters]):
         self.trajectory(TrajectoryOrder.of(self._orders, trajectory, at_end, self.config.mission.contact_time))
         return self._orders
 
-    def go(self, offset: np.ndarray, duration: float) -> int:
+    def move(self, offset: np.ndarray, duration: float) -> int:
         """Order a move by an offset [m] from where the vehicle is or is on its way to, at rest at both ends."""
-        p = self.wanted if self.state is State.HOVERING else self.p_WB
+        p = self.reference_position if self.state is State.HOVERING else self.p_WB
         return self.follow(rest_to_rest(p, p + offset, 0.0, 0.0, duration, self.time + LEAD))
 
     def perch(self, trajectory: FlatTrajectory, target: Target) -> int:
@@ -152,7 +152,7 @@ class ScriptedMission(Component[MissionParameters]):
         if self._target is None or not (-m.contact_early < self.time - self.contact_due < m.contact_time + 0.2) or self.state is not State.TRACKING:
             self._adhesion.reset()
             return
-        e = self.believed
+        e = self.latest_odometry
         if self._adhesion.attached(BodyState(*(np.array(x) for x in (e.p_WB, e.q_WB, e.v_WB, e.w_B))), self._target):
             self._target = None
             self.order(Command.ATTACHED, "the surface carries the vehicle")
@@ -212,7 +212,7 @@ class ScriptedFlight:
             PerchError: the estimator is not ready in time.
         """
         while self.mission.estimator is None or self.mission.estimator.state != RUNNING:
-            if self.time > PATIENCE:
+            if self.time > READY_TIMEOUT:
                 raise PerchError("the estimator is not ready" + (f": {self.mission.estimator.message}" if self.mission.estimator else ""))
             self.step()
         self.run(self.time + 0.2)
@@ -221,8 +221,8 @@ class ScriptedFlight:
         self.step()
         return ordered
 
-    def flew(self, order: int | None) -> bool:
-        """Whether the controller has taken up an order; where it has not, its last event says why."""
+    def accepted(self, order: int | None) -> bool:
+        """Whether the controller has accepted an order; if it has not, its last event has the reason."""
         return any(status.trajectory_id == order for status in self.loop.trace.values("controller/status"))
 
     def perch_plan(self, p: np.ndarray, start: float, shift: np.ndarray) -> FlatTrajectory:
@@ -231,7 +231,7 @@ class ScriptedFlight:
         Args:
             p: hover [m], as estimated.
             start: time of its start [s].
-            shift: estimated minus true position [m]: the pad is localised from where the vehicle believes to be.
+            shift: estimated minus true position [m]: the pad is localised relative to the estimated position.
 
         Raises:
             PerchError: there is none.

@@ -2,8 +2,8 @@
 
 Fast DDS removes its segments when a process ends by itself. A killed one leaves up to some megabytes in
 `/dev/shm`, until the machine is full. Other people's segments are never touched: only those that our own
-processes were seen to use, and that nobody uses any more, or whose maker has ended: a participant that was
-not told of that end holds such a segment until its process ends.
+processes were observed to use, and that no process uses any more, or whose creator has ended: a participant that
+did not notice that end holds such a segment until its process ends.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ class SharedMemory:
         proc: the process file system.
 
     Attributes:
-        seen: the remembered segments.
+        segments: those that were observed.
     """
 
     def __init__(self, proc: Path = Path("/proc")) -> None:
         self._proc = proc
-        self.seen: set[str] = set()
+        self.segments: set[str] = set()
 
     def observe(self, pids: Iterable[int]) -> None:
-        """Remember the segments that these processes use now."""
+        """Record the segments that these processes use now."""
         for pid in pids:
-            self.seen |= self._used_by(self._proc / str(pid))
+            self.segments |= self._used_by(self._proc / str(pid))
 
     def clean(self) -> list[str]:
-        """Remove the remembered segments that no process uses any more, or whose maker has ended, with their lock files; one that a
+        """Remove the recorded segments that no process uses any more, or whose creator has ended, with their lock files; one that a
         process which is about to end has made anew is removed by the next call.
 
         Returns:
             The files that were removed.
         """
-        if not self.seen:
+        if not self.segments:
             return []
         removed = []
-        for segment in sorted(self.unused(self.seen)):
+        for segment in sorted(self.unused(self.segments)):
             mutex = Path(segment).with_name(f"sem.{Path(segment).name}_mutex")  # stays after a process that ended by itself, too
             for file in (Path(segment), Path(f"{segment}_el"), Path(f"{segment}_sl"), mutex):
                 with suppress(OSError):  # gone already, or another user's
@@ -65,7 +65,7 @@ class SharedMemory:
     def _used_by(process: Path) -> set[str]:
         try:
             return set(_SEGMENT.findall((process / "maps").read_text()))
-        except OSError:  # the process has ended, or belongs to somebody else
+        except OSError:  # the process has ended, or belongs to another user
             return set()
 
 
@@ -74,9 +74,9 @@ def ports(domain: int) -> range:
     return range(7400 + 250 * domain, 7400 + 250 * (domain + 1))
 
 
-def of_ports(domain: int) -> set[Path]:
+def port_files(domain: int) -> set[Path]:
     """Files of the segments in which the ports of a ROS domain receive, with their locks."""
-    return {file for file in _FOLDER.glob("*fast*_port*") if (of := PORT.match(file.name)) and int(of[1]) in ports(domain)}
+    return {file for file in _FOLDER.glob("*fast*_port*") if (match := PORT.match(file.name)) and int(match[1]) in ports(domain)}
 
 
 def segment(file: Path) -> str:

@@ -20,11 +20,11 @@ from perch_core import config
 from perch_core.errors import PerchError
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
-from perch_eval.domain import own_domain
+from perch_eval.domain import domain_in_environment
 from perch_eval.evaluation.document import machine, table
-from perch_eval.modelled_sight_node import blind_launches, blind_programs
+from perch_eval.modelled_sight_node import imageless_launches, imageless_programs
 from perch_eval.nodes import FAST_NODES, node_programs, programs, sharing
-from perch_eval.revision import banner, made_of
+from perch_eval.revision import banner, code_version
 from perch_eval.ros.mission_client import MissionClient
 from perch_eval.stack import Stack, StackError
 from perch_sim.scenario import load_scenario
@@ -34,12 +34,12 @@ EXAMPLES = """examples:
   python3 scripts/soak.py --scenario line_80 --flights 10
   python3 scripts/soak.py --cameras --hours 0.1 --name cameras
 
-exit code: 0 every perch and departure succeeded, and nothing grows; 1 otherwise; 2 the caller's mistake"""
-SETTLED = 50          # flights after which memory must not grow any more
-BAR = 1.0             # growth of a process per 100 flights [MB]
-READY = 180.0         # [s]
-IN_A_ROW = 5          # failures after which it ends
-KEPT = 20             # flights after which what has been measured is written
+exit code: 0 every perch and departure succeeded, and nothing grows; 1 otherwise; 2 invalid input"""
+WARM_UP_FLIGHTS = 50          # after which memory must not grow any more
+MAX_GROWTH = 1.0              # of a process per 100 flights [MB]
+READY_TIMEOUT = 180.0         # [s]
+MAX_CONSECUTIVE_FAILURES = 5  # after which it ends
+SAVE_EVERY = 20               # flights after which what has been measured is written
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,11 @@ class Flight:
 
     Attributes:
         time: simulation time at its end [s].
-        outcome: of the goal, `perched` where it is good.
+        outcome: of the goal, `perched` if it succeeded.
         departed: the vehicle has left for a hover.
-        words: of what went wrong; empty: nothing.
+        words: the error message; empty: none.
         processes: name -> its sample.
-        shared: in /dev/shm, of everybody on this machine [MB].
+        shared: in /dev/shm, of all processes of this machine [MB].
     """
 
     time: float
@@ -85,23 +85,23 @@ def sample(pid: int) -> Sample:
 
 def slope(values: Sequence[float]) -> float | None:
     """Growth per 100 flights after the first ones, by least squares; None: too few to tell."""
-    rest = np.asarray(values[SETTLED:], float)
+    rest = np.asarray(values[WARM_UP_FLIGHTS:], float)
     return float(100.0 * np.polyfit(np.arange(len(rest)), rest, 1)[0]) if len(rest) >= 20 else None
 
 
 def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: float, flights: int | None, folder: Path,
-        keep: Callable[[Sequence[Flight]], object]) -> list[Flight]:
+        save: Callable[[Sequence[Flight]], object]) -> list[Flight]:
     """Fly until there has been so much simulated time, or so many flights.
 
     Args:
         name: of the scenario.
         seed: of every random number.
-        cameras: look at images; otherwise they are replaced by error models.
+        cameras: render and process images; otherwise they are replaced by error models.
         composed: nodes that share a process.
         hours: of simulated time.
         flights: at most so many; None: as time allows.
         folder: receives logs and parameters.
-        keep: receives what has been flown, now and then: should this process be killed, that is not lost.
+        save: receives the flights so far, regularly, so that they are not lost if this process is killed.
 
     Raises:
         PerchError: the stack does not come up, or breaks.
@@ -112,18 +112,18 @@ def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: f
     if cameras:
         started = programs(scenario, seed, scenario_source=str(source), composed=composed, folder=folder)
     else:
-        started = blind_programs(node_programs(blind_launches(scenario, seed, str(source), True), folder, composed=composed))
-    with own_domain(range(43, 70)), closing(MissionClient()) as pilot, closing(Progress(flights, what="flights")) as progress:
+        started = imageless_programs(node_programs(imageless_launches(scenario, seed, str(source), True), folder, composed=composed))
+    with domain_in_environment(range(43, 70)), closing(MissionClient()) as client, closing(Progress(flights, unit="flights")) as progress:
         try:
             with Stack(started, folder) as stack:
-                stack.wait_until_ready(pilot.visible_nodes, READY)
-                while pilot.time < 3600.0 * hours and (flights is None or len(found) < flights):
-                    found.append(_once(pilot, scenario, stack))
+                stack.wait_until_ready(client.visible_nodes, READY_TIMEOUT)
+                while client.time < 3600.0 * hours and (flights is None or len(found) < flights):
+                    found.append(_fly_once(client, scenario, stack))
                     progress.add(found[-1].departed)
-                    if len(found) % KEPT == 0:
-                        keep(found)
-                    if len(found) >= IN_A_ROW and not any(flight.departed for flight in found[-IN_A_ROW:]):
-                        print(f"\n{IN_A_ROW} failures in a row: {found[-1].words}", file=sys.stderr)
+                    if len(found) % SAVE_EVERY == 0:
+                        save(found)
+                    if len(found) >= MAX_CONSECUTIVE_FAILURES and not any(flight.departed for flight in found[-MAX_CONSECUTIVE_FAILURES:]):
+                        print(f"\n{MAX_CONSECUTIVE_FAILURES} failures in a row: {found[-1].words}", file=sys.stderr)
                         break
         except StackError as error:
             print(f"\n{error}", file=sys.stderr)
@@ -132,43 +132,43 @@ def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: f
     return found
 
 
-def _once(pilot: MissionClient, scenario: Any, stack: Stack) -> Flight:
-    outcome, words, departed = "failed", "", False
+def _fly_once(client: MissionClient, scenario: Any, stack: Stack) -> Flight:
+    outcome, error, departed = "failed", "", False
     try:
-        result = pilot.fly(scenario, check=stack.raise_if_ended)
-        outcome, words = result.outcome, "" if result.outcome == "perched" else result.message
+        result = client.fly(scenario, check=stack.raise_if_ended)
+        outcome, error = result.outcome, "" if result.outcome == "perched" else result.message
         if outcome in ("perched", "perched_already"):
-            departed, said = pilot.depart(stack.raise_if_ended)
-            words = words or ("" if departed else said)
+            departed, message = client.depart(stack.raise_if_ended)
+            error = error or ("" if departed else message)
     except StackError:
         raise
-    except PerchError as error:
-        words = str(error)
+    except PerchError as exception:
+        error = str(exception)
     shared = sum(file.stat().st_size for file in Path("/dev/shm").glob("*") if file.is_file()) / 1e6
-    return Flight(round(pilot.time, 3), outcome, departed, words, {name: sample(pid) for name, pid in stack.pids.items()}, round(shared, 3))
+    return Flight(round(client.time, 3), outcome, departed, error, {name: sample(pid) for name, pid in stack.pids.items()}, round(shared, 3))
 
 
 def growth(flights: Sequence[Flight]) -> dict[str, dict[str, Any]]:
-    """What each process does: its slope [MB per 100 flights], and the range of descriptors and threads after the first flights."""
+    """Growth of each process: its slope [MB per 100 flights], and the range of descriptors and threads after the first flights."""
     found = {}
     for name in flights[0].processes:
         own = [flight.processes[name] for flight in flights]
-        rest = own[min(SETTLED, len(own) // 2):]
+        rest = own[min(WARM_UP_FLIGHTS, len(own) // 2):]
         found[name] = {"rss_first_MB": own[0].rss, "rss_last_MB": own[-1].rss, "slope_MB_per_100": slope([one.rss for one in own]),
                        "descriptors": [min(one.descriptors for one in rest), max(one.descriptors for one in rest)],
                        "threads": [min(one.threads for one in rest), max(one.threads for one in rest)]}
     return found
 
 
-def verdicts(flights: Sequence[Flight]) -> list[str]:
-    """What is not as it should be."""
+def find_problems(flights: Sequence[Flight]) -> list[str]:
+    """Problems of the flights, one line each."""
     found = [f"flight {k + 1}: {flight.outcome}{'' if flight.departed else ', no departure'}: {flight.words}"
              for k, flight in enumerate(flights) if not flight.departed or flight.outcome != "perched"]
-    for name, of in growth(flights).items():
-        if of["slope_MB_per_100"] is not None and of["slope_MB_per_100"] > BAR:
-            found.append(f"{name}: memory grows by {of['slope_MB_per_100']:.2f} MB per 100 flights")
+    for name, figures in growth(flights).items():
+        if figures["slope_MB_per_100"] is not None and figures["slope_MB_per_100"] > MAX_GROWTH:
+            found.append(f"{name}: memory grows by {figures['slope_MB_per_100']:.2f} MB per 100 flights")
         for what in ("descriptors", "threads"):
-            low, high = of[what]
+            low, high = figures[what]
             found += [f"{name}: {what} between {low} and {high}"] if low != high else []
     return found
 
@@ -198,7 +198,8 @@ def page(folder: Path) -> str:
     runs = {file: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
     text = ["# Soak", "", banner([run["commit"] for run in runs.values()], [run.get("digest", "") for run in runs.values()]), "",
             "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart,",
-            f"perch again. Growth of memory by least squares over the flights after the first {SETTLED}; bar: {BAR:g} MB per 100 flights,",
+            f"perch again. Growth of memory by least squares over the flights after the first {WARM_UP_FLIGHTS}; "
+            f"bar: {MAX_GROWTH:g} MB per 100 flights,",
             "descriptors and threads constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
     for file, run in runs.items():
         good = sum(flight["departed"] and flight["outcome"] == "perched" for flight in run["flights"])
@@ -208,13 +209,13 @@ def page(folder: Path) -> str:
                  f"{good} of {len(run['flights'])} flights perched and departed, {minutes:.1f} min of simulated time in "
                  f"{run['wall_s'] / 60.0:.1f} min.",
                  "", *table("process | first [MB] | last [MB] | growth [MB per 100 flights] | descriptors | threads", (
-                     (name, f"{of['rss_first_MB']:.1f}", f"{of['rss_last_MB']:.1f}",
-                      "too few flights" if of["slope_MB_per_100"] is None else f"{of['slope_MB_per_100']:+.2f}",
-                      *(f"{low}" if low == high else f"{low} to {high}" for low, high in (of["descriptors"], of["threads"])))
-                     for name, of in run["growth"].items()))]
+                     (name, f"{figures['rss_first_MB']:.1f}", f"{figures['rss_last_MB']:.1f}",
+                      "too few flights" if figures["slope_MB_per_100"] is None else f"{figures['slope_MB_per_100']:+.2f}",
+                      *(f"{low}" if low == high else f"{low} to {high}" for low, high in (figures["descriptors"], figures["threads"])))
+                     for name, figures in run["growth"].items()))]
         shared = [flight["shared"] for flight in run["flights"]]
         bad = _grouped(run["problems"])
-        verdict = ["Not as it should be:", "", *(f"* {problem}" for problem in bad)] if bad else ["All as it should be."]
+        verdict = ["Problems:", "", *(f"* {problem}" for problem in bad)] if bad else ["No problems."]
         text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB.", *verdict, "", f"![{file.stem}]({file.stem}.png)"]
     return "\n".join(text) + "\n"
 
@@ -223,9 +224,9 @@ def _grouped(problems: list[str]) -> list[str]:
     """Equal problems of several flights as one."""
     flights: dict[str, list[str]] = {}
     for problem in problems:
-        flight, _, words = problem.removeprefix("flight ").partition(": ") if problem.startswith("flight ") else ("", "", problem)
-        flights.setdefault(words, []).append(flight)
-    return [words if numbers == [""] else f"flight{'s' if len(numbers) > 1 else ''} {', '.join(numbers)}: {words}" for words, numbers in flights.items()]
+        flight, _, text = problem.removeprefix("flight ").partition(": ") if problem.startswith("flight ") else ("", "", problem)
+        flights.setdefault(text, []).append(flight)
+    return [text if numbers == [""] else f"flight{'s' if len(numbers) > 1 else ''} {', '.join(numbers)}: {text}" for text, numbers in flights.items()]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -235,7 +236,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--seed", type=int, default=1, help="of every random number (default: %(default)s)")
     out.add_argument("--hours", type=float, default=1.0, help="of simulated time (default: %(default)s)")
     out.add_argument("--flights", type=count, metavar="N", help="at most so many")
-    out.add_argument("--cameras", action="store_true", help="render and look at images, too")
+    out.add_argument("--cameras", action="store_true", help="render and process images, too")
     out.add_argument("--composed", nargs="*", metavar="NODE",
                      help=f"nodes that share a process; all without names (default: {', '.join(FAST_NODES)})")
     out.add_argument("--name", help="of the run's files (default: the scenario's)")
@@ -250,7 +251,7 @@ def _soak(args: argparse.Namespace) -> int:
     if not 0.0 < args.hours <= 1000.0:
         raise PerchError(f"--hours {args.hours}: is outside (0, 1000]")
     output_folder(args.out), output_folder(args.logs, "--logs")
-    write = partial(_write, args, made_of(), began)
+    write = partial(_write, args, code_version(), began)
     composed = sharing(args.composed, otherwise=FAST_NODES)
     flights = fly(args.scenario, args.seed, args.cameras, composed, args.hours, args.flights, args.logs, write)
     if not flights:
@@ -261,8 +262,8 @@ def _soak(args: argparse.Namespace) -> int:
 
 
 def _write(args: argparse.Namespace, code: Mapping[str, str], began: float, flights: Sequence[Flight]) -> list[str]:
-    """Write figures and page of what has been flown; returns what is not as it should be."""
-    name, problems = args.name or Path(args.scenario).stem, verdicts(flights)
+    """Write figures and page of what has been flown; returns the problems."""
+    name, problems = args.name or Path(args.scenario).stem, find_problems(flights)
     plot(flights, args.out / f"{name}.png")
     (args.out / f"{name}.json").write_text(json.dumps({
         **code, "scenario": args.scenario, "seed": args.seed, "cameras": args.cameras, "machine": machine(),

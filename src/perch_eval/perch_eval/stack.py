@@ -1,4 +1,4 @@
-"""Starts, watches and stops a group of programs, each in its own process group. Knows nothing of ROS."""
+"""Starts, watches and stops a group of programs, each in its own process group. Independent of ROS."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from perch_eval.shared_memory import SharedMemory
 
 _ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 1.0), (signal.SIGKILL, 1.0))
 """Signals to stop with, and how long each has [s]: on a busy machine a recording may need seconds to be finished."""
-_AT_START = ((signal.SIGTERM, 0.5), (signal.SIGKILL, 1.0))
+_STARTUP_ESCALATION = ((signal.SIGTERM, 0.5), (signal.SIGKILL, 1.0))
 """The same while programs load and compile: they have nothing to finish, and Python would show a traceback of SIGINT."""
 _POLL_S = 0.02
 
@@ -35,8 +35,8 @@ class StackError(PerchError):
         self.endings = tuple(endings)
 
     @property
-    def callers_mistake(self) -> bool:
-        """Whether a program refused what it was given (exit code 2)."""
+    def refused_input(self) -> bool:
+        """Whether a program refused its arguments or parameters (exit code 2)."""
         return any(ending.code == 2 for ending in self.endings)
 
 
@@ -84,7 +84,7 @@ class Stack:
                 raise StackError(f"{program.name} cannot be started: there is no executable {program.command[0]}")
             log = self._log_dir / f"{program.name}.log"
             try:
-                with _deferred_signals():  # an interrupt within Popen would leave a program that nobody stops
+                with _deferred_signals():  # an interrupt within Popen would leave a program running
                     self._started[program.name] = RunningProgram(program, log, self._environment, self._on_line)
             except OSError as error:
                 raise StackError(f"{program.name} cannot be started: {error}") from None
@@ -108,12 +108,12 @@ class Stack:
         Raises:
             StackError: a program ended meanwhile, or its nodes do not appear.
         """
-        wanted = {node for program in self._programs for node in program.nodes}
+        expected = {node for program in self._programs for node in program.nodes}
         last = time.monotonic() + timeout
-        while not wanted <= (seen := visible()):
+        while not expected <= (found := visible()):
             self.raise_if_ended()
             if time.monotonic() > last:
-                missing = ", ".join(sorted(wanted - seen))
+                missing = ", ".join(sorted(expected - found))
                 raise StackError(f"not ready after {timeout:g} s: {missing}. Logs: {self._log_dir}")
             time.sleep(_POLL_S)
         self.raise_if_ended()
@@ -141,11 +141,11 @@ class Stack:
         """
         with _handled_by(signal.SIG_IGN):
             self._memory.observe(self.pids.values())
-            for number, patience in _ESCALATION if self._ready else _AT_START:
+            for number, timeout in _ESCALATION if self._ready else _STARTUP_ESCALATION:
                 running = [program for program in self._started.values() if program.running]
                 for program in running:
                     program.signal(number)
-                deadline = time.monotonic() + patience
+                deadline = time.monotonic() + timeout
                 for program in running:
                     program.wait(max(0.0, deadline - time.monotonic()))
             for program in self._started.values():

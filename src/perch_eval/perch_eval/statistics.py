@@ -21,7 +21,7 @@ class Rate:
     trials: int
 
     @classmethod
-    def of(cls, outcomes: Iterable[bool]) -> Rate:
+    def from_outcomes(cls, outcomes: Iterable[bool]) -> Rate:
         """Of the trials' outcomes: whether each was a success."""
         found = list(outcomes)
         return cls(sum(found), len(found))
@@ -55,14 +55,14 @@ class Spread:
     count: int
 
     @classmethod
-    def of(cls, values: Iterable[float | None]) -> Spread:
+    def from_values(cls, values: Iterable[float | None]) -> Spread:
         """Of any values; those that are None or not finite are left out."""
         finite = [float(v) for v in values if v is not None and math.isfinite(v)]
         if not finite:
             return cls(math.nan, math.nan, math.nan, 0)
         return cls(float(np.median(finite)), min(finite), max(finite), len(finite))
 
-    def words(self, scale: float = 1.0, digits: int = 1, unit: str = "") -> str:
+    def to_text(self, scale: float = 1.0, digits: int = 1, unit: str = "") -> str:
         """`1.2 [0.8, 2.0] cm`, or a dash without values."""
         if not self.count:
             return "-"

@@ -1,4 +1,4 @@
-"""The pad seen by the front camera along a flight of `estimation_flight`, and how wrong and how sure its pose relative to the vehicle is.
+"""The pad as localised by the front camera along a flight of `estimation_flight`: errors and covariances of its pose relative to the vehicle.
 
 The images have the camera's calibration errors, the body's pose is the estimator's, so that everything is in the error that
 `target/pose` claims to know: that of T_BS, in the axes of W.
@@ -49,8 +49,8 @@ def estimated_body(flight: Flight, track: EstimatorTrack, time: float) -> BodySt
                      truth.w_WB_B[0] + e[9:12], J @ track.covariances[k] @ J.T)
 
 
-def see_target(scenario: Scenario, flight: Flight, track: EstimatorTrack, seed: int, begin: float, end: float) -> Sightings:
-    """Look at the pad at the camera's rate.
+def localize_target(scenario: Scenario, flight: Flight, track: EstimatorTrack, seed: int, begin: float, end: float) -> Sightings:
+    """Localise the pad at the camera's rate.
 
     Args:
         scenario: room, pad and realism.
@@ -68,7 +68,7 @@ def see_target(scenario: Scenario, flight: Flight, track: EstimatorTrack, seed: 
     for k, middle in enumerate(times):
         poses = flight.motion.sample(middle + np.linspace(-0.5, 0.5, 5) * renderer.exposure.time)
         image = renderer.render(list(zip(poses.p_WB, poses.R_WB)), rng)
-        exposed = float(middle + real.stamp_offset - mount.stamp_offset)  # as the stamp says it
+        exposed = float(middle + real.stamp_offset - mount.stamp_offset)  # by the stamp
         body = estimated_body(flight, track, exposed)
         found = localizer.process(image, exposed, body).board
         if found is not None:

@@ -22,9 +22,9 @@ from perch_eval.in_process import Sensing, fly
 from perch_sim.scenario import load_scenario
 
 SCENARIO = "surface_90"
-SIMULATED = 1.5   # [s] long enough for VIO to start and the filter to take its poses
-CLOCK_BEGINS = 1.0  # [s] the vehicle's
-PATIENCE = 600.0  # [s] wall clock
+SIMULATED_TIME = 1.5   # [s] long enough for VIO to start and the filter to take its poses
+CLOCK_START = 1.0  # [s] the vehicle's
+TIMEOUT = 600.0  # [s] wall clock
 
 
 def flight() -> bool:
@@ -41,20 +41,20 @@ def nodes() -> bool:
     Raises:
         PerchError: a node ended, or did not come up.
     """
-    from perch_eval.domain import own_domain
+    from perch_eval.domain import domain_in_environment
     from perch_eval.nodes import ALL_NODES, programs
     from perch_eval.ros.mission_client import MissionClient
     from perch_eval.stack import Stack
 
     scenario = load_scenario(SCENARIO)
-    with tempfile.TemporaryDirectory() as name, own_domain():
+    with tempfile.TemporaryDirectory() as name, domain_in_environment():
         folder = Path(name)
-        overrides = {"vehicle": {"lockstep_timeout": PATIENCE}}
+        overrides = {"vehicle": {"lockstep_timeout": TIMEOUT}}
         started = programs(scenario, composed=ALL_NODES, record=folder / "flight.mcap", folder=folder, overrides=overrides)
         with Stack(started, folder) as stack, closing(MissionClient()) as client:
-            stack.wait_until_ready(client.visible_nodes, PATIENCE)
-            client.linger(CLOCK_BEGINS + SIMULATED, stack.raise_if_ended, PATIENCE)
-            return client.time >= CLOCK_BEGINS + SIMULATED
+            stack.wait_until_ready(client.visible_nodes, TIMEOUT)
+            client.linger(CLOCK_START + SIMULATED_TIME, stack.raise_if_ended, TIMEOUT)
+            return client.time >= CLOCK_START + SIMULATED_TIME
 
 
 if __name__ == "__main__":

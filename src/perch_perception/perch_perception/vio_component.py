@@ -114,7 +114,7 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         if result.outcome is not self._outcome:
             self._outcome = result.outcome
             (self.info if result.outcome.has_pose else self.warn)(f"{result.outcome.name.lower()}: {result.message}")
-        if pixels is not None and self.debug_image.wanted:
+        if pixels is not None and self.debug_image.has_receivers:
             self._draw(image, pixels, result)
         if self._diagnosed is None or abs(image.stamp - self._diagnosed) >= DIAGNOSTICS_PERIOD:
             self._diagnosed = image.stamp

@@ -241,8 +241,8 @@ def prove_rate(forces: Array, squares: Array, jerks: Array, yaw: Array, duration
         sampled: an attained rate below the limit [rad/s].
 
     Returns:
-        (proved, doubt, doubt_at, found, found_at): the proved bound, or infinity and segment and place where the limit is in
-        doubt; segment and place of a rate above the sampled one; segments are -1 where there is none.
+        (proved, failed, failed_at, found, found_at): the proved bound, or infinity and segment and place where the proof of the
+        limit fails; segment and place of a rate above the sampled one; segments are -1 where there is none.
     """
     found, found_at = -1, 0.0
     attained, most = sampled, sampled

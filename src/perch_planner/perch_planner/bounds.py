@@ -136,7 +136,7 @@ def maximum(coefficients: Array, tolerance: float, floor: float) -> tuple[float,
 
     Args:
         coefficients: Bernstein coefficients, shape (n + 1,).
-        tolerance: wanted width of the enclosure, in the polynomial's unit.
+        tolerance: required width of the enclosure, in the polynomial's unit.
         floor: values below it need not be enclosed; -inf: all values are.
 
     Returns:
@@ -172,7 +172,7 @@ def maximum(coefficients: Array, tolerance: float, floor: float) -> tuple[float,
             attained, place = stack[top, 0], middle
         depth[top] = depth[top + 1] = level
         start[top], start[top + 1] = middle, begin
-        # The half with the larger coefficients is looked at first: it raises `attained` sooner.
+        # The half with the larger coefficients is visited first: it raises `attained` sooner.
         if largest(stack[top]) > largest(stack[top + 1]):
             for k in range(n):
                 stack[top, k], stack[top + 1, k] = stack[top + 1, k], stack[top, k]

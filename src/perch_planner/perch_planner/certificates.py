@@ -55,8 +55,8 @@ def perch_certificates(search: Search, outcome: Outcome) -> tuple[Certificate, .
     """
     if not len(outcome.results):
         return ()
-    least, most, question = search.settings.impact_speed_min, search.settings.impact_speed_max, search.question
-    speed, end = _impact(outcome.coefficients, outcome.durations, question.v_S, question.s3)
+    least, most, plan_limits = search.settings.impact_speed_min, search.settings.impact_speed_max, search.plan_limits
+    speed, end = _impact(outcome.coefficients, outcome.durations, plan_limits.v_S, plan_limits.s3)
     impact = Certificate(quantity="impact_speed", unit="m/s", lower_limit=least, upper_limit=most, minimum=speed, maximum=speed,
                          time_of_minimum=end, time_of_maximum=end, method="bernstein", holds=bool(least - INSET <= speed <= most + INSET))
     return (*certificates(outcome.results, search.limits, search.vehicle.mass), impact)

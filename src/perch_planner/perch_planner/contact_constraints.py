@@ -78,10 +78,10 @@ def tube_bounds(end_acceleration: Array, share: float, floor: float) -> tuple[Ar
 
 
 @compiled
-def _window(R_WS: Array, velocity: Array, later: Array, least: float, most: float, tangential: float) -> tuple[Array, Array, Array]:
+def _window(R_WS: Array, velocity: Array, velocity_change: Array, least: float, most: float, tangential: float) -> tuple[Array, Array, Array]:
     """Directions and bounds of the velocity at contact: along -s3, then the facets of the octagon. [defines M:eq14]
 
-    They hold for a contact on time and for a delayed one, after a change of the velocity by `later` [m/s], shape (3,). Where no
+    They hold for a contact on time and for a delayed one, after `velocity_change` [m/s], shape (3,). Where no
     velocity satisfies the bounds at both times, the change is limited to their width: the velocity of a contact on time then
     lies on the edge of its bounds that is nearest to those of the delayed one.
     """
@@ -95,7 +95,7 @@ def _window(R_WS: Array, velocity: Array, later: Array, least: float, most: floa
             else:
                 directions[k, d] = _OCTAGON[k - 1, 0] * R_WS[d, 0] + _OCTAGON[k - 1, 1] * R_WS[d, 1]
             shift += directions[k, d] * velocity[d]
-            changes[k] += directions[k, d] * later[d]
+            changes[k] += directions[k, d] * velocity_change[d]
         lower[k] = shift + (least if k == 0 else -tangential)
         upper[k] = shift + (most if k == 0 else tangential)
     slip = np.abs(changes[1:]).max()

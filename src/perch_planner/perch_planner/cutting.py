@@ -20,13 +20,13 @@ from perch_planner.bounds import derivative, derivatives_at, value
 from perch_planner.linear_bounds import BoundArrays, no_bounds
 from perch_planner.plan_checks import BODY_RATE, CLEARANCE, HEIGHT, SPEED
 
-_KEEP = 0.995       # cuts from above are set to this share of the limit, so that few rounds suffice
-_RIM_ROOM = 1.1    # times the rim's reach at the present tilt, as the tilt changes with the cut
-_KEEP_RATE = 0.95   # of the body rate's limit
-_RAISE = 1.02       # cuts of the thrust from below
-_HEIGHT_ROOM = 2e-3  # [m]
-_BESIDE = 1.0 / 24.0  # of a segment: peaks are flat, and a cut at the peak alone moves it to the side
-_FLAT = 0.97        # of the limit; a peak is cut beside its place where the thrust is above this share
+_UPPER_CUT_SHARE = 0.995        # cuts from above are set to this share of the limit, so that few rounds suffice
+_RIM_FACTOR = 1.1               # times the rim's reach at the present tilt, as the tilt changes with the cut
+_RATE_CUT_SHARE = 0.95          # of the body rate's limit
+_LOWER_CUT_FACTOR = 1.02        # cuts of the thrust from below
+_HEIGHT_INSET = 2e-3            # [m]
+_NEIGHBOUR_OFFSET = 1.0 / 24.0  # of a segment: peaks are flat, and a cut at the peak alone moves it to the side
+_NEIGHBOUR_THRUST_SHARE = 0.97  # of the limit; a peak is cut beside its place where the thrust is above this share
 
 
 @compiled
@@ -38,7 +38,7 @@ def _specific_force(coefficients: Array, duration: float, place: float) -> tuple
 
 
 @compiled
-def thrust_cuts(coefficients: Array, durations: Array, extrema: Array, low: float, high: float, side: Array) -> BoundArrays:
+def thrust_cuts(coefficients: Array, durations: Array, extrema: Array, low: float, high: float, fallback_direction: Array) -> BoundArrays:
     """Cuts where the specific thrust leaves [low, high]. [M:eq16]
 
     Args:
@@ -46,28 +46,28 @@ def thrust_cuts(coefficients: Array, durations: Array, extrema: Array, low: floa
         durations: shape (f,) [s].
         extrema: result of `plan_checks.thrust_extrema`.
         low, high: limits of the specific thrust [m/s^2].
-        side: unit vector of the cut where the thrust nearly vanishes, shape (3,).
+        fallback_direction: unit vector of the cut where the thrust nearly vanishes, shape (3,).
 
     Returns:
         Fields of `Bounds`.
     """
-    most = 0
+    capacity = 0
     for i in range(len(durations)):
-        most += 3 * (extrema[i, 4] > high) + (extrema[i, 1] < low)
-    owner, segments, places, orders, direction, lower, upper = no_bounds(most, most)
+        capacity += 3 * (extrema[i, 4] > high) + (extrema[i, 1] < low)
+    owner, segments, places, orders, direction, lower, upper = no_bounds(capacity, capacity)
     r = 0
     for i in range(len(durations)):
         if extrema[i, 4] > high:
             for beside in range(-1, 2):
-                place = extrema[i, 5] + beside * _BESIDE
+                place = extrema[i, 5] + beside * _NEIGHBOUR_OFFSET
                 if place < 0.0 or place > 1.0:
                     continue
                 x, y, z, norm = _specific_force(coefficients[i], durations[i], place)
-                if beside != 0 and norm < _FLAT * high:
+                if beside != 0 and norm < _NEIGHBOUR_THRUST_SHARE * high:
                     continue
                 owner[r], segments[r], places[r] = r, i, place
                 direction[r, 0], direction[r, 1], direction[r, 2] = x / norm, y / norm, z / norm
-                upper[r] = _KEEP * high - direction[r, 2] * GRAVITY
+                upper[r] = _UPPER_CUT_SHARE * high - direction[r, 2] * GRAVITY
                 r += 1
         if extrema[i, 1] < low:
             x, y, z, norm = _specific_force(coefficients[i], durations[i], extrema[i, 2])
@@ -75,13 +75,13 @@ def thrust_cuts(coefficients: Array, durations: Array, extrema: Array, low: floa
             if norm > 0.5 * low:
                 direction[r, 0], direction[r, 1], direction[r, 2] = x / norm, y / norm, z / norm
             else:
-                direction[r, 0], direction[r, 1], direction[r, 2] = side[0], side[1], side[2]
-            lower[r] = _RAISE * low - direction[r, 2] * GRAVITY
+                direction[r, 0], direction[r, 1], direction[r, 2] = fallback_direction[0], fallback_direction[1], fallback_direction[2]
+            lower[r] = _LOWER_CUT_FACTOR * low - direction[r, 2] * GRAVITY
             r += 1
     return owner[:r], segments[:r], places[:r], orders[:r], direction[:r], lower[:r], upper[:r]
 
 
-def turning_side(heading: float) -> Array:
+def turn_direction(heading: float) -> Array:
     """Unit vector through which the thrust turns from upward to s3: opposite to the approach heading [rad], shape (3,)."""
     return np.array([-cos(heading), -sin(heading), 0.0])
 
@@ -92,7 +92,7 @@ def limit_cuts(where: Array, coefficients: Array, yaw: Array, durations: Array, 
     """Cuts where speed, height, clearance or body rate could not be proved.
 
     Args:
-        where: places of doubt, from `plan_checks.check`.
+        where: places where a proof failed, from `plan_checks.check`.
         coefficients, yaw, durations: the plan.
         p_S, v_S, s3, low_height, high_height, speed, rate, extension: as for `plan_checks.check`.
 
@@ -106,7 +106,7 @@ def limit_cuts(where: Array, coefficients: Array, yaw: Array, durations: Array, 
             continue
         i = int(where[row, 0])
         for beside in range(-1, 2):
-            s = where[row, 1] + beside * _BESIDE
+            s = where[row, 1] + beside * _NEIGHBOUR_OFFSET
             if beside != 0 and (row != BODY_RATE or s < 0.0 or s > 1.0):
                 continue
             x = derivatives_at(coefficients[i], durations[i], s, 4)
@@ -116,18 +116,18 @@ def limit_cuts(where: Array, coefficients: Array, yaw: Array, durations: Array, 
             squared = max(dot(f, f), 1e-9)
             if row == SPEED:
                 norm = np.sqrt(dot(x[1], x[1]))
-                orders[t], upper[r] = 1, _KEEP * speed
+                orders[t], upper[r] = 1, _UPPER_CUT_SHARE * speed
                 for d in range(3):
                     direction[t, d] = x[1, d] / norm
             elif row == HEIGHT:
                 orders[t], direction[t, 2] = 0, 1.0
-                lower[r], upper[r] = low_height + _HEIGHT_ROOM, high_height - _HEIGHT_ROOM
+                lower[r], upper[r] = low_height + _HEIGHT_INSET, high_height - _HEIGHT_INSET
             elif row == CLEARANCE:
                 # The rim's distance at the present tilt: right to first order where the tilt does not change.
                 tilt = np.sqrt(max(1.0 - dot(f, s3) ** 2 / squared, 0.0))
                 time = durations[:i].sum() + s * durations[i]
                 orders[t] = 0
-                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + _RIM_ROOM * extension * tilt + _HEIGHT_ROOM
+                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + _RIM_FACTOR * extension * tilt + _HEIGHT_INSET
                 for d in range(3):
                     direction[t, d] = s3[d]
             else:
@@ -140,7 +140,7 @@ def limit_cuts(where: Array, coefficients: Array, yaw: Array, durations: Array, 
                 turning = cross(f, j)
                 spin = spin_rate(f[0], f[1], f[2], turning[0], turning[1], value(yaw[i], s),
                                  value(derivative(yaw[i], 1), s) / durations[i])
-                share = _KEEP_RATE * rate / np.sqrt(1.0 + (spin * norm / across) ** 2)
+                share = _RATE_CUT_SHARE * rate / np.sqrt(1.0 + (spin * norm / across) ** 2)
                 owner[t + 1], segments[t + 1], places[t + 1] = r, i, s
                 orders[t] = 3
                 upper[r] = share * f[2] / norm * GRAVITY

@@ -72,7 +72,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
 
     def preload(self) -> Callable[[], None]:
         """Return the function that loads or compiles the kernels."""
-        return partial(_load, self.config.settings, self._vehicle)
+        return partial(_warm_up, self.config.settings, self._vehicle)
 
     def on_plan_perch(self, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
         """Plan a perch, and reply with the plan or a refusal."""
@@ -86,23 +86,23 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
 
     def _plan(self, method: Method, request: PerchPlanRequest, reply: Callable[[PerchPlan], None]) -> None:
         limit = self.config.time_limit
-        answer = partial(self._answer, method is planner.plan, request, reply, limit)
+        respond = partial(self._reply, method is planner.plan, request, reply, limit)
         try:
             limits.check("request", request)
             problem = perch_problem(request)
-            vehicle = self._vehicle.giving(request.thrust_ratio or 1.0)
+            vehicle = self._vehicle.with_thrust_ratio(request.thrust_ratio or 1.0)
             arguments = (method, problem, perch_settings(request, self.config.settings, problem.surface), vehicle)
         except PerchError as error:
-            answer(error)
+            respond(error)
             return
-        self.work(Job(solve, arguments, answer, limit, isolated=True))
+        self.work(Job(solve, arguments, respond, limit, isolated=True))
 
-    def _answer(self, perch: bool, request: PerchPlanRequest, reply: Callable[[PerchPlan], None], limit: float, found: Any) -> None:
+    def _reply(self, perch: bool, request: PerchPlanRequest, reply: Callable[[PerchPlan], None], limit: float, found: Any) -> None:
         """Reply with a plan, or with the error that occurred instead."""
         if isinstance(found, planner.PerchPlan):
             answer = perch_plan(found, request, CONTACT_TIME if perch else 0.0)
         else:
-            answer = refused(found, limit)
+            answer = refusal_response(found, limit)
             if perch:  # near the contact, ways out are refused one after the other
                 self.warn(f"no plan: {answer.message}")
         self.diagnostics(Diagnostics(limits.stamp_of(request), {
@@ -111,13 +111,13 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         reply(answer)
 
 
-def _load(settings: PerchSettings, vehicle: Vehicle) -> None:
+def _warm_up(settings: PerchSettings, vehicle: Vehicle) -> None:
     """Plan once with each method, so that the kernels are compiled before the first request."""
     surface = PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), math.radians(60.0))
     try:
         for method in (planner.plan, plan_way_out):
             method(PerchProblem(StartState(np.array([0.0, 0.0, 1.5])), surface), settings, vehicle)
-    except PerchRefusal:  # these limits may leave no plan; the kernels are there all the same
+    except PerchRefusal:  # these limits may permit no plan; the kernels are compiled all the same
         pass
 
 
@@ -131,7 +131,7 @@ def solve(method: Method, problem: PerchProblem, settings: PerchSettings, vehicl
         return method(problem, settings, vehicle)
     except (PerchError, MemoryError):
         raise
-    except Exception as error:  # whoever asked must get an answer whatever happens here
+    except Exception as error:  # every request must be answered
         raise PerchRefusal(refusals.SOLVER, "numerics", -math.inf, f"planning failed: {type(error).__name__}: {error}") from error
 
 
@@ -192,7 +192,7 @@ def perch_plan(found: planner.PerchPlan, request: PerchPlanRequest, contact_time
         certificates=found.certificates, iterations=found.iterations, solve_time=float(found.solve_time))
 
 
-def refused(error: Exception, limit: float) -> PerchPlan:
+def refusal_response(error: Exception, limit: float) -> PerchPlan:
     """Return the response without a plan.
 
     Args:
@@ -204,7 +204,7 @@ def refused(error: Exception, limit: float) -> PerchPlan:
                          certificates=error.certificates, iterations=error.iterations)
     if isinstance(error, JobStopped):
         return PerchPlan(success=False, error_code=PerchPlanError.TIME_LIMIT,
-                         message=f"no plan within time_limit {limit:g} s ({error}); ask for fewer waypoints or raise time_limit")
+                         message=f"no plan within time_limit {limit:g} s ({error}); request fewer waypoints or raise time_limit")
     if isinstance(error, ConfigError):
         return PerchPlan(success=False, error_code=PerchPlanError.BAD_INPUT, message=str(error))
     return PerchPlan(success=False, error_code=PerchPlanError.SOLVER, message=str(error))

@@ -106,7 +106,7 @@ def _sample(distance: Array, force: Array, jerk: Array, yaw: Array, yaw_rate: Ar
 
     Arrays are Bernstein coefficients with one row for each polynomial.
     """
-    gap, gap_at, rate, rate_at_ = np.inf, 0.0, 0.0, 0.0
+    gap, gap_place, rate, rate_place = np.inf, 0.0, 0.0, 0.0
     f, j = _values(force, _AT12), _values(jerk, _AT11)
     dist, heading, turn = _values(distance, _AT14), _values(yaw, _AT14), _values(yaw_rate, _AT13)
     count = len(_PLACES)
@@ -116,11 +116,11 @@ def _sample(distance: Array, force: Array, jerk: Array, yaw: Array, yaw_rate: Ar
         along = f_x * s3[0] + f_y * s3[1] + f_z * s3[2]
         here = dist[0, k] - extension * sqrt(max(1.0 - along * along / f2, 0.0))
         if here < gap:
-            gap, gap_at = here, k / (count - 1)
+            gap, gap_place = here, k / (count - 1)
         here = squared_rate(f_x, f_y, f_z, j[0, k], j[1, k], j[2, k], heading[0, k], turn[0, k])
         if here > rate:
-            rate, rate_at_ = here, k / (count - 1)
-    return gap, gap_at, sqrt(rate), rate_at_
+            rate, rate_place = here, k / (count - 1)
+    return gap, gap_place, sqrt(rate), rate_place
 
 
 @compiled
@@ -143,8 +143,8 @@ def _within(vector: Array, limit: float) -> bool:
 
 
 @compiled
-def _doubt(where: Array, row: int, segment: int, place: float) -> None:
-    """Record the first place at which a limit is in doubt."""
+def _record_failure(where: Array, row: int, segment: int, place: float) -> None:
+    """Record the first place at which the proof of a limit failed."""
     if where[row, 0] < 0.0:
         where[row, 0], where[row, 1] = segment, place
 
@@ -170,7 +170,7 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
 
     Returns:
         (results, where, holds): results, shape (5, 5), rows and columns as named above; where, shape (5, 2): segment and
-        place of the first doubt of each quantity, segment -1 where there is none; whether all limits hold.
+        place where the proof of each quantity first failed, segment -1 where none failed; whether all limits hold.
     """
     f = len(durations)
     out, where = np.empty((5, 5)), np.empty((5, 2))
@@ -187,9 +187,9 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
         _widen(out, attained, THRUST, MINIMUM, thrust[i, 0], thrust[i, 1], begin + T * thrust[i, 2])
         _widen(out, attained, THRUST, MAXIMUM, thrust[i, 3], thrust[i, 4], begin + T * thrust[i, 5])
         if thrust[i, 1] < low_thrust:
-            _doubt(where, THRUST, i, thrust[i, 2])
+            _record_failure(where, THRUST, i, thrust[i, 2])
         if thrust[i, 4] > high_thrust:
-            _doubt(where, THRUST, i, thrust[i, 5])
+            _record_failure(where, THRUST, i, thrust[i, 5])
 
         velocity = time_derivative(c, 1, T)
         reached = max(attained[SPEED, MAXIMUM], 0.0)
@@ -197,52 +197,52 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
             here, proved, place = _enclose(squared(velocity), speed * speed, reached * reached)
             _widen(out, attained, SPEED, MAXIMUM, sqrt(max(here, 0.0)), sqrt(max(proved, 0.0)), begin + T * place)
             if proved > speed * speed:
-                _doubt(where, SPEED, i, place)
+                _record_failure(where, SPEED, i, place)
 
         for k in range(15):
             down[0, k] = -c[2, k]
         here, proved, place = _enclose(down[0], -low_height, -attained[HEIGHT, MINIMUM])
         _widen(out, attained, HEIGHT, MINIMUM, -here, -proved, begin + T * place)
         if -proved < low_height:
-            _doubt(where, HEIGHT, i, place)
+            _record_failure(where, HEIGHT, i, place)
         here, proved, place = _enclose(c[2], high_height, attained[HEIGHT, MAXIMUM])
         _widen(out, attained, HEIGHT, MAXIMUM, here, proved, begin + T * place)
         if proved > high_height:
-            _doubt(where, HEIGHT, i, place)
+            _record_failure(where, HEIGHT, i, place)
         begin += T
 
     forces, squares, jerks, distances = np.empty((f, 3, 13)), np.empty((f, 25)), np.empty((f, 3, 12)), np.empty((f, 15))
     # Backwards, as the vehicle turns and comes near at the end: most segments before need no samples then.
-    gap_wanted, rate_wanted = np.inf, min(1e-3, 0.5 * rate)
+    gap_sampled, rate_sampled = np.inf, min(1e-3, 0.5 * rate)
     coarse = np.empty(f)
     for i in range(f - 1, -1, -1):
         T, c, heading = durations[i], coefficients[i], yaw[i:i + 1]
         forces[i], jerks[i] = specific_force(c, T), time_derivative(c, 3, T)
         squares[i], distances[i] = squared(forces[i]), surface_distance(c, T, begins[i], p_S, v_S, s3)
         coarse[i] = rate_coarse_bound(forces[i], squares[i], jerks[i], yaw[i], T)
-        if smallest(distances[i]) - extension >= gap_wanted and coarse[i] <= min(rate_wanted, 0.999 * rate):
+        if smallest(distances[i]) - extension >= gap_sampled and coarse[i] <= min(rate_sampled, 0.999 * rate):
             continue
-        gap, gap_at, rate_here, rate_at_ = _sample(distances[i:i + 1], forces[i], jerks[i], heading,
-                                                   time_derivative(heading, 1, T), s3, extension)
-        if gap < gap_wanted:
-            gap_wanted, out[CLEARANCE, MINIMUM_AT] = gap, begins[i] + T * gap_at
-        if rate_here > rate_wanted:
-            rate_wanted, out[BODY_RATE, MAXIMUM_AT] = rate_here, begins[i] + T * rate_at_
+        gap, gap_place, rate_here, rate_place = _sample(distances[i:i + 1], forces[i], jerks[i], heading,
+                                                        time_derivative(heading, 1, T), s3, extension)
+        if gap < gap_sampled:
+            gap_sampled, out[CLEARANCE, MINIMUM_AT] = gap, begins[i] + T * gap_place
+        if rate_here > rate_sampled:
+            rate_sampled, out[BODY_RATE, MAXIMUM_AT] = rate_here, begins[i] + T * rate_place
         if rate_here >= rate:
-            where[BODY_RATE, 0], where[BODY_RATE, 1] = i, rate_at_  # in the end the first segment that is too fast
+            where[BODY_RATE, 0], where[BODY_RATE, 1] = i, rate_place  # in the end the first segment that is too fast
     out[SPEED, MINIMUM] = out[BODY_RATE, MINIMUM] = 0.0
     out[CLEARANCE, MAXIMUM] = np.inf
-    out[CLEARANCE, MINIMUM], i, place = prove_clearance(distances, forces, squares, s3, extension, clearance, gap_wanted)
+    out[CLEARANCE, MINIMUM], i, place = prove_clearance(distances, forces, squares, s3, extension, clearance, gap_sampled)
     if i >= 0:
-        _doubt(where, CLEARANCE, i, place)
-        if gap_wanted < clearance:
-            out[CLEARANCE, MINIMUM] = gap_wanted
-    out[BODY_RATE, MAXIMUM] = np.inf if rate_wanted < rate else rate_wanted
-    if rate_wanted < rate:  # else a sample is too fast
+        _record_failure(where, CLEARANCE, i, place)
+        if gap_sampled < clearance:
+            out[CLEARANCE, MINIMUM] = gap_sampled
+    out[BODY_RATE, MAXIMUM] = np.inf if rate_sampled < rate else rate_sampled
+    if rate_sampled < rate:  # else a sample is too fast
         out[BODY_RATE, MAXIMUM], i, place, found, found_at = prove_rate(forces, squares, jerks, yaw, durations, coarse, rate,
-                                                                        rate_wanted)
+                                                                        rate_sampled)
         if i >= 0:
-            _doubt(where, BODY_RATE, i, place)
+            _record_failure(where, BODY_RATE, i, place)
         if found >= 0:
             out[BODY_RATE, MAXIMUM_AT] = begins[found] + found_at * durations[found]
     holds = True

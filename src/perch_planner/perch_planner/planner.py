@@ -61,7 +61,7 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     """
     begin = perf_counter()
     limits = Limits.of(settings, vehicle)
-    refusals.refuse_hopeless(problem, settings, limits, vehicle)
+    refusals.check_feasibility(problem, settings, limits, vehicle)
     search = Search(problem, settings, vehicle, limits)
     durations, outcome = search.run()
     if not outcome.proved:

@@ -20,7 +20,7 @@ from perch_planner.powerline.request import PowerlineRequest
 from perch_planner.powerline.settings import DEADLINE_MAX, PowerlineSettings
 
 FIRST_SHARE = 0.6  # of the deadline: when the first solver has not answered by then, ipopt gets the rest
-_FALLBACK_LEAST = 0.05  # it needs more than that [s]
+_FALLBACK_MIN = 0.05  # it needs more than that [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class Task:
         vehicle: name or file.
         settings: of the planner.
         request: request of the planner.
-        start: as in `service.answer`.
+        start: as in `service.plan_response`.
     """
 
     vehicle: str
@@ -64,47 +64,47 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
         self._vehicle = load_vehicle(config.vehicle)
         self._model = RotorModel.of(self._vehicle)
         # The deadline may change, and goes with each request.
-        own = {field.name: getattr(config, field.name) for field in fields(PowerlineSettings)}
-        self._settings = PowerlineSettings(**own | {"deadline": PowerlineSettings.deadline})
+        planner_settings = {field.name: getattr(config, field.name) for field in fields(PowerlineSettings)}
+        self._settings = PowerlineSettings(**planner_settings | {"deadline": PowerlineSettings.deadline})
         self._settings.check(self._vehicle)
 
     def preload(self) -> Callable[[], Any]:
         """Return the function that loads the planner, and compiles it the first time on a machine."""
-        return partial(planner_of, self.config.vehicle, self._settings)
+        return partial(cached_planner, self.config.vehicle, self._settings)
 
     def on_plan_powerline(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None]) -> None:
         """Plan a perch or recovery, and reply with the plan or a refusal."""
         try:
             service.check_request(request)
             deadline = min(float(request.deadline or self.config.deadline), DEADLINE_MAX)
-            wanted = replace(service.planner_request(request, self._model, self._vehicle.wire_offset), deadline=deadline)
+            converted = replace(service.planner_request(request, self._model, self._vehicle.wire_offset), deadline=deadline)
         except PerchError as error:
             self._reply(request, reply, error)
             return
-        task = Task(self.config.vehicle, self._settings, wanted, request.start)
-        self._ask(request, reply, task)
+        task = Task(self.config.vehicle, self._settings, converted, request.start)
+        self._start_jobs(request, reply, task)
 
-    def _ask(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], task: Task) -> None:
+    def _start_jobs(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], task: Task) -> None:
         """Start the job of a task with a share of its deadline; ipopt gets the rest where that job is stopped."""
         deadline = task.request.deadline
         rest = (1.0 - FIRST_SHARE) * deadline
 
-        def then(found: Any) -> None:
+        def on_first_result(found: Any) -> None:
             if not isinstance(found, JobStopped):
                 self._reply(request, reply, found)
-            elif rest > _FALLBACK_LEAST:
-                again = replace(task, request=replace(task.request, solver="ipopt", deadline=rest))
-                self.work(Job(solve, (again,), partial(self._reply_late, request, reply, deadline), rest, isolated=True))
+            elif rest > _FALLBACK_MIN:
+                fallback = replace(task, request=replace(task.request, solver="ipopt", deadline=rest))
+                self.work(Job(solve, (fallback,), partial(self._reply_last, request, reply, deadline), rest, isolated=True))
             else:
-                self._reply_late(request, reply, deadline, found)
+                self._reply_last(request, reply, deadline, found)
 
-        first = replace(task, request=replace(task.request, deadline=FIRST_SHARE * deadline))  # it must know when it will be stopped
-        self.work(Job(solve, (first,), then, FIRST_SHARE * deadline, isolated=True))
+        first = replace(task, request=replace(task.request, deadline=FIRST_SHARE * deadline))  # the planner gets the time at which it will be stopped
+        self.work(Job(solve, (first,), on_first_result, FIRST_SHARE * deadline, isolated=True))
 
-    def _reply_late(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], deadline: float, found: Any) -> None:
+    def _reply_last(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], deadline: float, found: Any) -> None:
         if isinstance(found, JobStopped):
             found = PlanningRefusal("deadline", "wall-clock time", -1.0, f"no plan within {deadline:g} s ({found}); allow more time, "
-                                                                         "ask again, or start from elsewhere")
+                                                                         "retry, or start from elsewhere")
         self._reply(request, reply, found)
 
     def _reply(self, request: PowerlinePlanRequest, reply: Callable[[PowerlinePlan], None], found: Any) -> None:
@@ -112,7 +112,7 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
         if isinstance(found, PowerlinePlan):
             answer = found
         else:
-            answer = service.refused(found)
+            answer = service.refusal_response(found)
             self.warn(f"no plan: {answer.message}")
         self.diagnostics(Diagnostics(limits.stamp_of(request), {
             "success": answer.success, "error_code": int(answer.error_code), "iterations": answer.iterations,
@@ -121,7 +121,7 @@ class PowerlinePlannerComponent(Component[PowerlinePlannerParameters]):
 
 
 @lru_cache(maxsize=2)
-def planner_of(vehicle: str, settings: PowerlineSettings) -> PowerlinePlanner:
+def cached_planner(vehicle: str, settings: PowerlineSettings) -> PowerlinePlanner:
     """Return a planner with everything loaded that its first plan needs; cached for the next plans of this process."""
     planner = PowerlinePlanner(load_vehicle(vehicle), settings)
     planner.warm_up()
@@ -134,10 +134,10 @@ def solve(task: Task) -> PowerlinePlan:
     Raises:
         PlanningRefusal: no plan was found; code `solver` after an unexpected error.
     """
-    planner = planner_of(task.vehicle, task.settings)
+    planner = cached_planner(task.vehicle, task.settings)
     try:
-        return service.answer(planner.plan(task.request), planner.solver.model, task.start)
+        return service.plan_response(planner.plan(task.request), planner.solver.model, task.start)
     except (PerchError, MemoryError):
         raise
-    except Exception as error:  # whoever asked must get an answer whatever happens here
+    except Exception as error:  # every request must be answered
         raise PlanningRefusal("solver", "numerics", -math.inf, f"planning failed: {type(error).__name__}: {error}") from error

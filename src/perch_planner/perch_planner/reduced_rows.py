@@ -19,8 +19,8 @@ Rows = tuple[Array, Array, Array]
 
 
 @compiled
-def _place(local: Array, segment: int, first: int, wide: Array, centre: Array, column: Array, constant: Array) -> None:
-    """Whiten a functional of a segment: factors of w to `column`, optimum value to `constant`; wide: `spread` transposed."""
+def _whiten_functional(local: Array, segment: int, first: int, spread_T: Array, centre: Array, column: Array, constant: Array) -> None:
+    """Whiten a functional of a segment: factors of w to `column`, optimum value to `constant`; spread_T: `spread` transposed."""
     count = FUNCTIONS if first >= 0 else HERMITE
     for d in range(3):
         constant[d] = 0.0
@@ -31,7 +31,7 @@ def _place(local: Array, segment: int, first: int, wide: Array, centre: Array, c
         for d in range(3):
             constant[d] += local[k] * centre[n, d]
         for i in range(len(column)):
-            column[i] += local[k] * wide[n, i]
+            column[i] += local[k] * spread_T[n, i]
 
 
 @compiled
@@ -65,13 +65,13 @@ def rows_of(program: ProgramArrays, bounds: BoundArrays) -> Rows:
     """Convert fields of `Bounds` into unit rows (r, 3 size) and bounds (r,), (r,) of a program of `reduced_qp.assemble`."""
     durations, first, unit, spread, centre = program
     owner, segments, places, orders, direction, lower, upper = bounds
-    m, wide = len(spread), spread.T.copy()
+    m, spread_T = len(spread), spread.T.copy()
     rows, low, high = np.zeros((len(lower), 3 * m)), lower.copy(), upper.copy()
     column, constant = np.empty(m), np.empty(3)
     for q in range(len(owner)):
         i, r = segments[q], owner[q]
         if q == 0 or i != segments[q - 1] or places[q] != places[q - 1] or orders[q] != orders[q - 1]:
-            _place(functional(durations[i], unit, places[q], orders[q]), i, first[i], wide, centre, column, constant)
+            _whiten_functional(functional(durations[i], unit, places[q], orders[q]), i, first[i], spread_T, centre, column, constant)
         for d in range(3):
             if direction[q, d] != 0.0:
                 for k in range(m):

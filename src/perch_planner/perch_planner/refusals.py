@@ -40,8 +40,9 @@ class PerchRefusal(PlanningRefusal):
 
 
 @compiled
-def _figures(points: Array, a: Array, j: Array, yaw: float, yaw_rate: float, R_WS: Array, extension: float, offset: float, moving: bool,
-             low_height: float, high_height: float, clearance: float) -> tuple[float, float, float, float, int, float, int, float, float]:
+def _precheck_quantities(points: Array, a: Array, j: Array, yaw: float, yaw_rate: float, R_WS: Array, extension: float, offset: float,
+                         moving: bool, low_height: float, high_height: float, clearance: float
+                         ) -> tuple[float, float, float, float, int, float, int, float, float]:
     """Quantities of a plan that its start and its points determine.
 
     Args:
@@ -59,27 +60,27 @@ def _figures(points: Array, a: Array, j: Array, yaw: float, yaw_rate: float, R_W
     """
     x, y, z = a[0], a[1], a[2] + GRAVITY
     specific, rate = sqrt(x * x + y * y + z * z), sqrt(squared_rate(x, y, z, j[0], j[1], j[2], yaw, yaw_rate))
-    lean = min(abs(x * R_WS[0, 2] + y * R_WS[1, 2] + z * R_WS[2, 2]) / max(specific, 1e-9), 1.0)
-    last, wrong, near = len(points) - 1, -1, -1
+    cosine = min(abs(x * R_WS[0, 2] + y * R_WS[1, 2] + z * R_WS[2, 2]) / max(specific, 1e-9), 1.0)
+    last, out_of_range, too_near = len(points) - 1, -1, -1
     start = height = distance = 0.0
-    way = -abs(offset)
+    path_length = -abs(offset)
     for k in range(last + 1):
         z = points[k, 2] + (offset * R_WS[2, 2] if k == last else 0.0)
-        if wrong < 0 and not (moving and k == last) and not low_height <= z <= high_height:
-            wrong, height = k, z
-        far = 0.0
+        if out_of_range < 0 and not (moving and k == last) and not low_height <= z <= high_height:
+            out_of_range, height = k, z
+        plane_distance = 0.0
         for d in range(3):
-            far += R_WS[d, 2] * (points[k, d] - points[last, d])
+            plane_distance += R_WS[d, 2] * (points[k, d] - points[last, d])
         if k:
-            way += norm((points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1], points[k, 2] - points[k - 1, 2]))
+            path_length += norm((points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1], points[k, 2] - points[k - 1, 2]))
         if k == 0:
-            start = far
-        elif k < last and near < 0 and far <= clearance:
-            near, distance = k, far
-    return specific, rate, extension * sqrt(1.0 - lean * lean), start, wrong, height, near, distance, way
+            start = plane_distance
+        elif k < last and too_near < 0 and plane_distance <= clearance:
+            too_near, distance = k, plane_distance
+    return specific, rate, extension * sqrt(1.0 - cosine * cosine), start, out_of_range, height, too_near, distance, path_length
 
 
-def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle) -> None:
+def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle) -> None:
     """Refuse problems that no trajectory can solve, before a QP is solved.
 
     Raises:
@@ -96,45 +97,45 @@ def refuse_hopeless(problem: PerchProblem, settings: PerchSettings, limits: Limi
         margin = min(contact - low, high - contact)
         raise PerchRefusal(
             UNREACHABLE_TILT, "thrust at contact m alpha within [tau_min, tau_max] [M:eq9, M:eq11]", margin,
-            f"holding the surface's attitude takes m alpha = {contact:.3f} N, outside [{low:.3f}, {high:.3f}] N; "
+            f"the surface's attitude requires m alpha = {contact:.3f} N, outside [{low:.3f}, {high:.3f}] N; "
             f"choose impact_acceleration between {low / vehicle.mass:.2f} and {high / vehicle.mass:.2f} m/s^2")
     hover = vehicle.mass * GRAVITY
     if high <= 1.02 * hover:
         raise PerchRefusal(THRUST_FLOOR, "hover thrust m g below tau_max [M:eq16]", high - 1.02 * hover,
-                           f"thrust_max {high:.3f} N leaves nothing above the hover thrust {hover:.3f} N")
+                           f"thrust_max {high:.3f} N leaves no reserve above the hover thrust {hover:.3f} N")
     start, surface = problem.start, problem.surface
-    specific, rate, rim, distance, wrong, height, near, at_waypoint, way = _figures(
+    specific, rate, rim, distance, out_of_range, height, too_near, waypoint_distance, path_length = _precheck_quantities(
         problem.points, start.a, start.j, start.yaw, start.yaw_rate, surface.R_WS, limits.extension, vehicle.perch_offset, bool(problem.target_velocity[2]),
         *limits.height, limits.clearance)
     specific *= vehicle.mass
     if not low <= specific <= high:
         raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
                            min(specific - low, high - specific),
-                           f"the start state already asks for {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N")
+                           f"the start state requires {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N")
     if rate > (1.0 + _ROUNDING) * limits.body_rate:
         raise PerchRefusal(BODY_RATE, "body rate of the start state [M:eq13]", limits.body_rate - rate,
-                           f"the start state already turns with {rate:.1f} rad/s, more than body_rate_max {limits.body_rate:g} rad/s")
-    if wrong >= 0:
+                           f"the body rate of the start state is {rate:.1f} rad/s, more than body_rate_max {limits.body_rate:g} rad/s")
+    if out_of_range >= 0:
         margin = min(height - limits.height[0], limits.height[1] - height)
-        name = ("start", *(f"waypoint {i}" for i in range(len(problem.waypoints))), "contact")[wrong]
+        name = ("start", *(f"waypoint {i}" for i in range(len(problem.waypoints))), "contact")[out_of_range]
         raise PerchRefusal(BOX, f"height of the {name}", margin,
                            f"{name} height {height:.3f} m is outside [{limits.height[0]:g}, {limits.height[1]:g}] m")
     speed, at_rest = hypot(*start.v.tolist()), not any(problem.target_velocity.tolist())
     if speed > limits.speed:
         raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
                            f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s")
-    if way > limits.speed * settings.duration_max and at_rest:
-        raise PerchRefusal(BOX, "speed_max and duration_max", limits.speed * settings.duration_max - way,
-                           f"the way to the contact is {way:.1f} m, longer than speed_max {limits.speed:g} m/s goes in duration_max "
+    if path_length > limits.speed * settings.duration_max and at_rest:
+        raise PerchRefusal(BOX, "speed_max and duration_max", limits.speed * settings.duration_max - path_length,
+                           f"the path to the contact is {path_length:.1f} m, longer than speed_max {limits.speed:g} m/s covers in duration_max "
                            f"{settings.duration_max:g} s")
     if distance <= rim + limits.clearance:
         raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
-                           f"the start is {_place(distance)}; it needs more than {rim + limits.clearance:.3f} m in front of it")
-    if near >= 0 and at_rest:
-        raise PerchRefusal(BOX, f"clearance of waypoint {near - 1} from the surface's plane", at_waypoint - limits.clearance,
-                           f"waypoint {near - 1} is {_place(at_waypoint)}; it needs more than {limits.clearance:.3f} m in front of it")
+                           f"the start is {_describe_distance(distance)}; it needs more than {rim + limits.clearance:.3f} m in front of it")
+    if too_near >= 0 and at_rest:
+        raise PerchRefusal(BOX, f"clearance of waypoint {too_near - 1} from the surface's plane", waypoint_distance - limits.clearance,
+                           f"waypoint {too_near - 1} is {_describe_distance(waypoint_distance)}; it needs more than {limits.clearance:.3f} m in front of it")
 
 
-def _place(distance: float) -> str:
+def _describe_distance(distance: float) -> str:
     """A signed distance from the surface's plane [m] in words."""
     return f"{abs(distance):.3f} m {'in front of' if distance >= 0.0 else 'behind'} the surface's plane"

@@ -1,6 +1,6 @@
 """Diagnosis of a failed search: a small set of limits whose relaxation admits a plan, and by how much to relax them.
 
-Only limits that acted on the search can be the cause: the search is the same without any other. Limits whose removal alone may
+Only limits that influenced the search can be the cause: the search is the same without any other. Limits whose removal alone may
 suffice are removed one at a time: first those that a caller can change, then the range of the single rotors, which binds before
 other limits of the vehicle. Where no single one suffices, all are removed, and restored one by one where a plan keeps them (the
 deletion filter of Chinneck and Dravnieks, 1991). Bisection reduces the relaxation. The reported values are kept by a plan.
@@ -23,25 +23,25 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Outcome, Search
 
-PROGRAMS = 170
+PROGRAMS_MAX = 170
 """Greatest number of quadratic programs in all searches with relaxed limits."""
-_EACH = 30       # of one of them
-_TRIALS = 3      # of values: what the plan took of a limit, then halves of the logarithm
-_LEAST = 1 / 64  # of what a plan takes beyond a limit that was taken away; less is not tried
+_PROGRAMS_PER_TRIAL = 30  # of one of them
+_VALUE_TRIALS = 3         # of values: what the plan took of a limit, then halves of the logarithm
+_SHARE_MIN = 1 / 64       # of what a plan takes beyond a limit that was removed; less is not tried
 
 
 class _Limit(NamedTuple):
     """A limit that a trial can relax.
 
     Attributes:
-        free: value of the setting that removes the limit.
+        unlimited: value of the setting that removes the limit.
         code: refusal code where this limit is the cause.
-        words, unit: its name and unit in messages.
+        label, unit: its name and unit in messages.
     """
 
-    free: float
+    unlimited: float
     code: str
-    words: str
+    label: str
     unit: str = ""
 
 
@@ -57,7 +57,7 @@ _LIMITS = {
     "clearance_min": _Limit(-1e3, refusals.BOX, "clearance from the surface until contact", "m"),
     "tangential_speed_max": _Limit(20.0, refusals.INFEASIBLE_WINDOW, "slip over the surface at contact [M:eq14]", "m/s"),
 }
-_ALONE = ("height_min", "height_max", "duration_max", "speed_max", "rotor_margin")  # tried one at a time
+_SINGLE_LIMITS = ("height_min", "height_max", "duration_max", "speed_max", "rotor_margin")  # tried one at a time
 
 
 def refusal(search: Search, best: Outcome) -> PerchRefusal:
@@ -71,131 +71,132 @@ def refusal(search: Search, best: Outcome) -> PerchRefusal:
         A refusal whose `relaxed` holds settings that admit a plan; it is empty where none was found even without limits.
     """
     settings, vehicle = search.settings, search.vehicle
-    asked = _asked(settings, Limits.of(settings, vehicle))
+    requested = _requested(settings, Limits.of(settings, vehicle))
     proofs = perch_certificates(search, best)
     longest = max((attempt.duration for attempt in search.attempts), default=0.0)
     tried = f"{search.iterations} programs up to {longest:.2f} s"
     least, most = vehicle.thrust_min, vehicle.thrust_max
-    way = _Trials(search, asked).way()
-    if way is None and (guess := float(search.first.sum())) > settings.duration_max:
+    relaxed_limits = _Trials(search, requested).relaxation()
+    if relaxed_limits is None and (guess := float(search.initial_durations.sum())) > settings.duration_max:
         return PerchRefusal(refusals.BOX, "duration_max", settings.duration_max - guess,
                             f"no plan within duration_max {settings.duration_max:g} s ({tried}), where the first guess is {guess:.2f} s, nor without "
-                            "limits; start nearer, ask for fewer waypoints, or raise duration_max", proofs, search.iterations)
-    if way is None:
+                            "limits; start nearer, request fewer waypoints, or raise duration_max", proofs, search.iterations)
+    if relaxed_limits is None:
         return PerchRefusal(refusals.INFEASIBLE_WINDOW, "impact window and tube [M:eq14, M:eq15]", -inf,
                             f"no plan, even without the other limits ({tried}); widen the impact speeds or the tube", proofs,
                             search.iterations)
-    name, value = next(iter(way.items()))
-    kept = " and ".join(dict.fromkeys(_LIMITS[name].words for name in way))
-    first = " and ".join(_said(name, value, least, most) for name, value in way.items())
-    return PerchRefusal(_LIMITS[name].code, kept, -abs(value - asked[name]),
-                        f"no plan keeps the {kept} ({tried}); with {first} there is one", proofs, search.iterations, way)
+    name, value = next(iter(relaxed_limits.items()))
+    names = " and ".join(dict.fromkeys(_LIMITS[name].label for name in relaxed_limits))
+    values = " and ".join(_format(name, value, least, most) for name, value in relaxed_limits.items())
+    return PerchRefusal(_LIMITS[name].code, names, -abs(value - requested[name]),
+                        f"no plan keeps the {names} ({tried}); with {values} there is one", proofs, search.iterations, relaxed_limits)
 
 
-def _asked(settings: PerchSettings, limits: Limits) -> dict[str, float]:
+def _requested(settings: PerchSettings, limits: Limits) -> dict[str, float]:
     """Return the limits in force by the names of their settings."""
     return {name: getattr(settings, name) for name in _LIMITS} | {
         "thrust_min": limits.thrust[0], "thrust_max": limits.thrust[1], "body_rate_max": limits.body_rate}
 
 
-def _said(name: str, value: float, least: float, most: float) -> str:
+def _format(name: str, value: float, least: float, most: float) -> str:
     """Return a value as text; least, most: thrust range of a rotor [N]."""
-    beyond = ""
+    note = ""
     if name == "thrust_max" and value > 4.0 * most:
-        beyond = f" (the vehicle has {4.0 * most:.3g} N)"
+        note = f" (the vehicle has {4.0 * most:.3g} N)"
     if name == "rotor_margin" and value < 0.0:
-        free = value * (most - least)
-        beyond = f" (rotors from {least + free:.2f} to {most - free:.2f} N; the vehicle's from {least:.2f} to {most:.2f} N)"
+        margin = value * (most - least)
+        note = f" (rotors from {least + margin:.2f} to {most - margin:.2f} N; the vehicle's from {least:.2f} to {most:.2f} N)"
     unit = _LIMITS[name].unit
-    return f"{name} {value:g}{' ' + unit if unit else ''}{beyond}"
+    return f"{name} {value:g}{' ' + unit if unit else ''}{note}"
 
 
-def _free(names: Iterable[str]) -> dict[str, float]:
+def _removed_limits(names: Iterable[str]) -> dict[str, float]:
     """Return the values that remove limits."""
-    return {name: _LIMITS[name].free for name in names}
+    return {name: _LIMITS[name].unlimited for name in names}
 
 
 class _Trials:
     """Searches with relaxed limits, bounded by their total number of programs."""
 
-    def __init__(self, search: Search, asked: dict[str, float]) -> None:
-        self._search, self._asked, self._left = search, asked, PROGRAMS
+    def __init__(self, search: Search, requested: dict[str, float]) -> None:
+        self._search, self._requested, self._programs_left = search, requested, PROGRAMS_MAX
         self._tried: dict[frozenset[str], dict[str, float] | None] = {}
 
-    def _used(self, changes: dict[str, Any]) -> dict[str, float] | None:
+    def _usage_under(self, changes: dict[str, Any]) -> dict[str, float] | None:
         """Return what a plan under changed settings uses of each limit; None where a short search finds no plan."""
-        if not changes or self._left <= 0:
+        if not changes or self._programs_left <= 0:
             return None
         settings = replace(self._search.settings, minimum_time=False, **changes)
-        trial = Search(self._search.problem, settings, self._search.vehicle, Limits.of(settings, self._search.vehicle), min(_EACH, self._left))
+        trial = Search(self._search.problem, settings, self._search.vehicle, Limits.of(settings, self._search.vehicle),
+                       min(_PROGRAMS_PER_TRIAL, self._programs_left))
         _, outcome = trial.run()
-        self._left -= trial.iterations
-        return _used(trial.problem, outcome, trial.vehicle) if outcome.proved else None
+        self._programs_left -= trial.iterations
+        return _limit_usage(trial.problem, outcome, trial.vehicle) if outcome.proved else None
 
-    def _without(self, names: Iterable[str]) -> dict[str, float] | None:
+    def _usage_without(self, names: Iterable[str]) -> dict[str, float] | None:
         """Return what a plan without some limits uses of each limit; None where a short search finds no plan."""
-        taken = frozenset(names)
-        if taken not in self._tried:
-            self._tried[taken] = self._used(_free(names))
-        return self._tried[taken]
+        removed = frozenset(names)
+        if removed not in self._tried:
+            self._tried[removed] = self._usage_under(_removed_limits(names))
+        return self._tried[removed]
 
-    def _smallest(self) -> tuple[list[str], dict[str, float]] | None:
+    def _smallest_removal(self) -> tuple[list[str], dict[str, float]] | None:
         """Return a small set of limits whose removal admits a plan, and the use of that plan; None: no plan without limits."""
-        taken = [name for name in _LIMITS if name != "thrust_min"]  # where the thrust may vanish, proofs fail
-        used = self._without(taken)  # first, as it takes few programs: what is named where they are used up before fewer limits are tried
-        for name in _ALONE:
-            if name in self._search.acted and (found := self._without([name])):
+        removed = [name for name in _LIMITS if name != "thrust_min"]  # where the thrust may vanish, proofs fail
+        used = self._usage_without(removed)  # first, as it takes few programs: the result where they are used up before fewer limits are tried
+        for name in _SINGLE_LIMITS:
+            if name in self._search.active_limits and (found := self._usage_without([name])):
                 return [name], found
         if not used:
-            taken = list(_LIMITS)
-            if not (used := self._without(taken)):
+            removed = list(_LIMITS)
+            if not (used := self._usage_without(removed)):
                 return None
         for name in reversed(_LIMITS):
-            beyond = self._beyond(taken, used)
-            if found := self._without(beyond):
-                taken, used = beyond, found
-            left = [n for n in taken if n != name]
-            if found := self._without(left):
-                taken, used = left, found
-        return self._beyond(taken, used) or taken, used
+            violated = self._violated(removed, used)
+            if found := self._usage_without(violated):
+                removed, used = violated, found
+            fewer = [n for n in removed if n != name]
+            if found := self._usage_without(fewer):
+                removed, used = fewer, found
+        return self._violated(removed, used) or removed, used
 
-    def _beyond(self, names: Iterable[str], used: dict[str, float]) -> list[str]:
+    def _violated(self, names: Iterable[str], used: dict[str, float]) -> list[str]:
         """Return the limits whose requested values a plan violates."""
-        return [n for n in names if (used[n] - self._asked[n]) * (_LIMITS[n].free - self._asked[n]) > 0.0]
+        return [n for n in names if (used[n] - self._requested[n]) * (_LIMITS[n].unlimited - self._requested[n]) > 0.0]
 
-    def way(self) -> dict[str, float] | None:
+    def relaxation(self) -> dict[str, float] | None:
         """Return values of limits that admit a plan, as near to the requested ones as bisection finds; None: none exist."""
-        if (smallest := self._smallest()) is None:
+        if (smallest := self._smallest_removal()) is None:
             return None
         names, used = smallest
-        values, low, high, share = self._shares(names, used, 1.0), _LEAST, 2.0, 1.0  # under a limit a plan may need more than it took without
-        for _ in range(_TRIALS):
-            tried = self._shares(names, used, share)
-            if self._used(tried):
+        values, low, high, share = self._relaxed_limits(names, used, 1.0), _SHARE_MIN, 2.0, 1.0  # under a limit a plan may need more than it took without
+        for _ in range(_VALUE_TRIALS):
+            tried = self._relaxed_limits(names, used, share)
+            if self._usage_under(tried):
                 values, high = tried, share
             else:
                 low = share
             share = sqrt(low * high)
         return values
 
-    def _shares(self, names: Iterable[str], used: dict[str, float], share: float) -> dict[str, float]:
+    def _relaxed_limits(self, names: Iterable[str], used: dict[str, float], share: float) -> dict[str, float]:
         """Return limits relaxed by a share of the excess of a plan over them; 1 covers all of it."""
         values = {}
         for name in names:
-            asked, free = self._asked[name], _LIMITS[name].free
-            values[name] = sorted((asked, _outward(asked, asked + share * (used[name] - asked)), free))[1]
+            requested, unlimited = self._requested[name], _LIMITS[name].unlimited
+            values[name] = sorted((requested, _round_away(requested, requested + share * (used[name] - requested)), unlimited))[1]
         return values
 
 
-def _outward(asked: float, value: float) -> float:
+def _round_away(requested: float, value: float) -> float:
     """Round a value to two digits of its difference from the requested one, away from the requested one."""
-    if value == asked:
+    if value == requested:
         return value
-    unit = 10.0 ** (floor(log10(abs(value - asked))) - 1)
-    return round((ceil if value > asked else floor)(value / unit) * unit, 9)
+    unit = 10.0 ** (floor(log10(abs(value - requested))) - 1)
+    return round((ceil if value > requested else floor)(value / unit) * unit, 9)
 
 
-def _used(problem: PerchProblem, outcome: Outcome, vehicle: Vehicle) -> dict[str, float]:
+def _limit_usage(problem: PerchProblem, outcome: Outcome, vehicle: Vehicle) -> dict[str, float]:
     """Return what a plan uses of each limit, by the names of their settings."""
     rows = dict(zip(plan_checks.NAMES, outcome.results))
     last, T = outcome.coefficients[-1], outcome.durations[-1]

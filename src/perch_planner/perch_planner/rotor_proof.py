@@ -21,13 +21,13 @@ from perch_planner.rotor_thrusts import motion, three_derivatives
 from perch_planner.taylor_models import (
     ROUNDING, ZERO, Taylor, Vector, add, axpy, cross, dot, greatest, inverse_root, least, mul, scale, sine, sub, times, vector_add)
 
-_LANES = 8       # intervals at a time: what a processor's vector unit takes at once
+_LANES = 8                  # intervals at a time: what a processor's vector unit takes at once
 _POWERS = 15
 _DEPTH = 30
 _NODES = 4000
-_LONGEST = 0.8   # [s] longer ones are halved at once: the models would be wide
-_TIGHT = 0.02    # proved bounds lie within this share of the range from what is attained
-_SMALLEST = 1e-6  # squared lengths that may be less have no direction
+_DURATION_MAX = 0.8         # [s] longer ones are halved at once: the models would be wide
+_TIGHTNESS = 0.02           # proved bounds lie within this share of the range from what is attained
+_SQUARED_LENGTH_MIN = 1e-6  # squared lengths that may be less have no direction
 
 _MIDDLES = (np.arange(_LANES) + 0.5) / _LANES
 _EXPANSION = np.hstack([comb(14, k) * (0.5 / _LANES) ** k * np.diff(np.eye(_POWERS), k) @ bernstein.basis(14 - k, _MIDDLES).T
@@ -39,12 +39,12 @@ _DERIVATIVES = np.hstack(_ELEVATED[2:]), np.hstack(_ELEVATED[:3])
 """Maps like those of `rotor_thrusts.bases_at`, but to Bernstein coefficients of degree 14 instead of values."""
 
 # Places in the work array: 12 models of the inputs, sine and cosine of the yaw, 4 models of the wrench, 4 rows of bounds.
-_TURN, _WRENCH, _BOUNDS = 48 * _LANES, 64 * _LANES, 80 * _LANES
-_FIRST = 16
+_YAW_AT, _WRENCH_AT, _BOUNDS_AT = 48 * _LANES, 64 * _LANES, 80 * _LANES
+_WRENCH_MODEL = 16
 
 
 @compiled
-def _numbers(rows: Array, powers: Array, work: Array) -> None:
+def _build_models(rows: Array, powers: Array, work: Array) -> None:
     """Compute the Taylor models of all inputs in each lane.
 
     Args:
@@ -64,16 +64,16 @@ def _numbers(rows: Array, powers: Array, work: Array) -> None:
 
 
 @compiled(inline=True)
-def _number(work: Array, n: int, lane: int) -> Taylor:
+def _model(work: Array, n: int, lane: int) -> Taylor:
     """The n-th model in a lane."""
     k = 4 * _LANES * n + lane
     return work[k], work[k + _LANES], work[k + 2 * _LANES], work[k + 3 * _LANES]
 
 
 @compiled(inline=True)
-def _vector(work: Array, n: int, lane: int) -> Vector:
+def _vector_model(work: Array, n: int, lane: int) -> Vector:
     """The n-th derivative of the specific force."""
-    return _number(work, 3 * n, lane), _number(work, 3 * n + 1, lane), _number(work, 3 * n + 2, lane)
+    return _model(work, 3 * n, lane), _model(work, 3 * n + 1, lane), _model(work, 3 * n + 2, lane)
 
 
 @compiled(inline=True)
@@ -109,7 +109,7 @@ def _wrench(f: Vector, df: Vector, ddf: Vector, h: Vector, dh: Vector, ddh: Vect
     b2 = cross(b3, b1)
     wx, wy, wz = times(-1.0, dot(b2, db3)), dot(b1, db3), dot(b2, db1)
     xy, yz, zx = mul(wx, wy), mul(wy, wz), mul(wz, wx)
-    return ((least(squared) > _SMALLEST) & (least(across) > _SMALLEST), times(mass, mul(squared, inverse)),
+    return ((least(squared) > _SQUARED_LENGTH_MIN) & (least(across) > _SQUARED_LENGTH_MIN), times(mass, mul(squared, inverse)),
             add(times(J[0], sub(yz, dot(b2, ddb3))), times(J[2] - J[1], yz)),
             add(times(J[1], sub(dot(b1, ddb3), zx)), times(J[0] - J[2], zx)),
             add(times(J[2], sub(dot(b2, ddb1), xy)), times(J[1] - J[0], xy)))
@@ -120,30 +120,30 @@ def _enclose(work: Array, mass: float, J: Vector3, mixing: Array) -> None:
     """Compute bounds of the rotor thrusts in each lane [N].
 
     Args:
-        work: models from `_numbers`; receives, from `_BOUNDS` on, least and greatest attained thrust, lower and upper bound.
+        work: models from `_build_models`; receives, from `_BOUNDS_AT` on, least and greatest attained thrust, lower and upper bound.
         mass, J, mixing: from `rotor_thrusts.rotor_model`.
     """
     for lane in range(_LANES):
         yaw = work[36 * _LANES + lane]
-        work[_TURN + lane], work[_TURN + _LANES + lane] = sin(yaw), cos(yaw)
+        work[_YAW_AT + lane], work[_YAW_AT + _LANES + lane] = sin(yaw), cos(yaw)
     for lane in range(_LANES):
-        h, dh, ddh = _heading(_number(work, 9, lane), _number(work, 10, lane), _number(work, 11, lane), work[_TURN + lane],
-                              work[_TURN + _LANES + lane])
-        defined, thrust, x, y, z = _wrench(_vector(work, 0, lane), _vector(work, 1, lane), _vector(work, 2, lane), h, dh, ddh, mass, J)
+        h, dh, ddh = _heading(_model(work, 9, lane), _model(work, 10, lane), _model(work, 11, lane), work[_YAW_AT + lane],
+                              work[_YAW_AT + _LANES + lane])
+        defined, thrust, x, y, z = _wrench(_vector_model(work, 0, lane), _vector_model(work, 1, lane), _vector_model(work, 2, lane), h, dh, ddh, mass, J)
         for k in range(4):
-            at = _WRENCH + k * _LANES + lane
+            at = _WRENCH_AT + k * _LANES + lane
             work[at], work[at + 4 * _LANES], work[at + 8 * _LANES], work[at + 12 * _LANES] = thrust[k], x[k], y[k], z[k]
-        work[_BOUNDS + lane] = np.inf if defined else -np.inf
+        work[_BOUNDS_AT + lane] = np.inf if defined else -np.inf
     for lane in range(_LANES):
-        lowest = below = work[_BOUNDS + lane]
+        lowest = below = work[_BOUNDS_AT + lane]
         highest = above = -lowest
         for q in range(4):
             rotor = (0.0, 0.0, 0.0, 0.0)
             for k in range(4):
-                rotor = add(rotor, times(mixing[q, k], _number(work, _FIRST + k, lane)))
+                rotor = add(rotor, times(mixing[q, k], _model(work, _WRENCH_MODEL + k, lane)))
             lowest, highest = min(lowest, rotor[0]), max(highest, rotor[0])
             below, above = min(below, least(rotor)), max(above, greatest(rotor))
-        at = _BOUNDS + lane
+        at = _BOUNDS_AT + lane
         work[at], work[at + _LANES], work[at + 2 * _LANES], work[at + 3 * _LANES] = lowest, highest, below, above
 
 
@@ -153,7 +153,7 @@ def prove_rotors(coefficients: Array, yaw: Array, durations: Array, lowest: floa
     """Prove that each rotor's thrust stays within [low, high], or find a thrust outside.
 
     Args:
-        coefficients, yaw, durations, mass, J, mixing: as for `rotor_thrusts.sampled`.
+        coefficients, yaw, durations, mass, J, mixing: as for `rotor_thrusts.sample_rotor_thrusts`.
         lowest, highest: attained thrusts, from samples [N].
         low, high: limits [N].
 
@@ -161,31 +161,31 @@ def prove_rotors(coefficients: Array, yaw: Array, durations: Array, lowest: floa
         (holds, lowest, highest): proved bounds of all thrusts [N]. Where a thrust violates the limits or the proof fails, `holds`
         is False, and the others are attained thrusts.
     """
-    tight, proved_low, proved_high = _TIGHT * (high - low), lowest, highest
-    powers, work = np.empty((12, _POWERS * _LANES)), np.empty(_BOUNDS + 4 * _LANES)
-    found = work[_BOUNDS:].reshape((4, _LANES))
+    tight, proved_low, proved_high = _TIGHTNESS * (high - low), lowest, highest
+    powers, work = np.empty((12, _POWERS * _LANES)), np.empty(_BOUNDS_AT + 4 * _LANES)
+    lane_bounds = work[_BOUNDS_AT:].reshape((4, _LANES))
     rows, length = np.empty((_DEPTH + 2, 12, _POWERS)), np.empty(_DEPTH + 2)
     nodes = 0
-    for i in range(len(durations) - 1, -1, -1):  # backwards: the end asks most of the rotors
-        here = coefficients[i] - coefficients[i][:, :1]  # exact differences: rounding would grow with the distance from the origin
-        rows[0, :9], length[0] = motion(here, durations[i], _DERIVATIVES[0]), durations[i]
+    for i in range(len(durations) - 1, -1, -1):  # backwards: the rotors are loaded most at the end
+        relative = coefficients[i] - coefficients[i][:, :1]  # exact differences: rounding would grow with the distance from the origin
+        rows[0, :9], length[0] = motion(relative, durations[i], _DERIVATIVES[0]), durations[i]
         three_derivatives(yaw[i:i + 1], 0, durations[i], _DERIVATIVES[1], rows[0, 9:])
         top = 1
         while top > 0:
             top -= 1
             nodes += 1
             open_halves = 3  # bit by bit: left, right
-            if length[top] <= _LONGEST:
-                _numbers(rows[top], powers, work)
+            if length[top] <= _DURATION_MAX:
+                _build_models(rows[top], powers, work)
                 _enclose(work, mass, J, mixing)
                 for lane in range(_LANES):
-                    if found[2, lane] > -np.inf:
-                        lowest, highest = min(lowest, found[0, lane]), max(highest, found[1, lane])
+                    if lane_bounds[2, lane] > -np.inf:
+                        lowest, highest = min(lowest, lane_bounds[0, lane]), max(highest, lane_bounds[1, lane])
                 if lowest < low or highest > high:
                     return False, lowest, highest
                 for half in range(2):
                     first, last = half * (_LANES // 2), (half + 1) * (_LANES // 2)
-                    below, above = smallest(found[2, first:last]) - ROUNDING, largest(found[3, first:last]) + ROUNDING
+                    below, above = smallest(lane_bounds[2, first:last]) - ROUNDING, largest(lane_bounds[3, first:last]) + ROUNDING
                     if below >= max(low, lowest - tight) and above <= min(high, highest + tight):
                         proved_low, proved_high = min(proved_low, below), max(proved_high, above)
                         open_halves -= 1 + half

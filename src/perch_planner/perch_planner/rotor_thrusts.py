@@ -29,13 +29,13 @@ from perch_planner.reference_element import DEGREE, FUNCTIONS, TABLES
 
 _COUNT = 49
 _PLACES = 0.5 - 0.5 * np.cos(np.pi * np.arange(_COUNT) / (_COUNT - 1))  # dense at the ends, where polynomials turn fastest
-_FREE_FALL = 1e-3   # [m/s^2] below this specific thrust no attitude and so no moment is defined
-_NO_THRUST = -1e3   # [N] in its place
-_ALONG = 1e-6       # sine of the angle between thrust and b2_des below which yaw defines no attitude
-_STEPS = (1e-4, 1e-3, 1e-2)  # of acceleration, jerk and snap in the linearisation
-_NEAR = 0.1         # rotors this near to a limit are bounded; share of the range
-_KEEP = 2e-3        # bounds are set inside by this share of the range,
-_BETWEEN = 1.5      # and by this multiple of what was seen between the places
+_FREE_FALL = 1e-3        # [m/s^2] below this specific thrust no attitude and so no moment is defined
+_NO_THRUST = -1e3        # [N] in its place
+_PARALLEL_SINE = 1e-6    # sine of the angle between thrust and b2_des below which yaw defines no attitude
+_DIFFERENCE_STEPS = (1e-4, 1e-3, 1e-2)  # of acceleration, jerk and snap in the linearisation
+_NEAR = 0.1              # rotors this near to a limit are bounded; share of the range
+_INSET_SHARE = 2e-3      # bounds are set inside by this share of the range,
+_OVERSHOOT_FACTOR = 1.5  # and by this multiple of the overshoot between the places
 
 
 RotorModel = tuple[float, Vector3, Array]
@@ -62,7 +62,7 @@ def bases_at(places: Array) -> tuple[Array, Array]:
     return np.hstack(rows[2:]), np.hstack(rows[:3])
 
 
-_MOVED, _TURNED = bases_at(_PLACES)
+_MOTION_BASIS, _HEADING_BASIS = bases_at(_PLACES)
 _FUNCTIONS_AT = np.vstack([bernstein.basis(DEGREE - n, _PLACES) @ TABLES[n, :DEGREE + 1 - n] for n in range(2, 5)])
 """Second to fourth derivative of the functions of the reference element at the places, shape (3 places, 15)."""
 
@@ -123,7 +123,7 @@ def plan_headings(yaw: Array, durations: Array) -> Array:
     """`headings` of each segment at the places where rotors may be bounded, shape (f, 6, 49); yaw: shape (f, 15) [rad]."""
     out = np.empty((len(durations), 6, _COUNT))
     for i in range(len(durations)):
-        out[i] = headings(yaw[i:i + 1], durations[i], _TURNED)
+        out[i] = headings(yaw[i:i + 1], durations[i], _HEADING_BASIS)
     return out
 
 
@@ -141,7 +141,7 @@ def thrusts_along(x: Array, heading: Array, mass: float, J: Vector3, mixing: Arr
         specific = norm(f)
         _, _, _, w, dw = commanded_frame(f, (x[3, k], x[4, k], x[5, k]), (x[6, k], x[7, k], x[8, k]), h, dh, ddh)
         M = axpy(1.0, times(J, dw), cross(w, times(J, w)))
-        undefined = falls | (norm(cross(h, f)) < _ALONG * specific)
+        undefined = falls | (norm(cross(h, f)) < _PARALLEL_SINE * specific)
         out[0, k] = _NO_THRUST if undefined else mass * specific
         for d in range(3):
             out[1 + d, k] = 0.0 if undefined else M[d]
@@ -168,7 +168,7 @@ def _vertex(values: Array, k: int, sign: float) -> tuple[float, float]:
 
 
 @compiled
-def sampled(coefficients: Array, heading: Array, durations: Array, mass: float, J: Vector3, mixing: Array) -> tuple[Array, Array]:
+def sample_rotor_thrusts(coefficients: Array, heading: Array, durations: Array, mass: float, J: Vector3, mixing: Array) -> tuple[Array, Array]:
     """Rotor thrusts of a plan on the places of each segment that may be bounded, and their extrema.
 
     Args:
@@ -185,7 +185,7 @@ def sampled(coefficients: Array, heading: Array, durations: Array, mass: float, 
     begin = 0.0
     for i in range(len(durations)):
         T = durations[i]
-        thrusts_along(motion(coefficients[i], T, _MOVED), heading[i], mass, J, mixing, thrusts[i])
+        thrusts_along(motion(coefficients[i], T, _MOTION_BASIS), heading[i], mass, J, mixing, thrusts[i])
         for q in range(4):
             place, value = _vertex(thrusts[i, q], thrusts[i, q].argmin(), -1.0)
             if value < row[0]:
@@ -202,7 +202,7 @@ def _slopes(x: Array, heading: Array, mass: float, J: Vector3, mixing: Array, th
     """Derivatives of the rotor thrusts with respect to specific force, jerk and snap, shape (9, 4, places)."""
     out = np.empty((9, 4, x.shape[1]))
     for e in range(9):
-        step = _STEPS[e // 3]
+        step = _DIFFERENCE_STEPS[e // 3]
         x[e] += step
         thrusts_along(x, heading, mass, J, mixing, out[e])
         x[e] -= step
@@ -242,17 +242,17 @@ def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients:
 
     Args:
         program: of `reduced_qp.assemble`.
-        thrusts, row: from `sampled`; extrema between the places tighten the bounds at the places.
-        coefficients, heading, mass, J, mixing: as for `sampled`.
+        thrusts, row: from `sample_rotor_thrusts`; extrema between the places tighten the bounds at the places.
+        coefficients, heading, mass, J, mixing: as for `sample_rotor_thrusts`.
         low, high: limits of a rotor's thrust [N].
 
     Returns:
         (keys, rows): for each rotor and place near a limit, an ascending key of segment, place and rotor, and a row of w.
     """
     durations, m = program[0], len(program[3])
-    near, keep = _NEAR * (high - low), _KEEP * (high - low)
-    above = low + keep + _BETWEEN * max(thrusts.min() - row[0], 0.0)
-    below = high - keep - _BETWEEN * max(row[2] - thrusts.max(), 0.0)
+    near, inset = _NEAR * (high - low), _INSET_SHARE * (high - low)
+    above = low + inset + _OVERSHOOT_FACTOR * max(thrusts.min() - row[0], 0.0)
+    below = high - inset - _OVERSHOOT_FACTOR * max(row[2] - thrusts.max(), 0.0)
     chosen = (thrusts < low + near) | (thrusts > high - near)
     chosen[1:, :, 0] = False  # the end of the segment before
     count = chosen.sum()
@@ -264,24 +264,24 @@ def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients:
         n = len(at)
         if n == 0:
             continue
-        x = motion(coefficients[i], durations[i], _MOVED)[:, at]
+        x = motion(coefficients[i], durations[i], _MOTION_BASIS)[:, at]
         slopes = _slopes(x, heading[i][:, at], mass, J, mixing, thrusts[i][:, at])
         values = _functions(program, i, at)
         for k in range(n):
             for q in range(4):
                 if not chosen[i, q, at[k]]:
                     continue
-                known = -thrusts[i, q, at[k]] - slopes[2, q, k] * GRAVITY  # the program knows the acceleration
+                constant = -thrusts[i, q, at[k]] - slopes[2, q, k] * GRAVITY  # the program has the acceleration, without gravity
                 for d in range(3):
                     a, j, s = slopes[d, q, k], slopes[3 + d, q, k], slopes[6 + d, q, k]
-                    known += (a * (x[d, k] - values[k, m + d]) + j * (x[3 + d, k] - values[n + k, m + d])
-                              + s * (x[6 + d, k] - values[2 * n + k, m + d]))
+                    constant += (a * (x[d, k] - values[k, m + d]) + j * (x[3 + d, k] - values[n + k, m + d])
+                                 + s * (x[6 + d, k] - values[2 * n + k, m + d]))
                     for c in range(m):
                         rows[r, d * m + c] = a * values[k, c] + j * values[n + k, c] + s * values[2 * n + k, c]
                 if thrusts[i, q, at[k]] < low + near:
-                    lower[r] = above + known
+                    lower[r] = above + constant
                 else:
-                    upper[r] = below + known
+                    upper[r] = below + constant
                 keys[r] = (i * _COUNT + at[k]) * 4 + q
                 r += 1
     normalise(rows, lower, upper)

@@ -8,25 +8,25 @@ import numpy as np
 
 from perch_core.vehicle import Vehicle
 from perch_planner.contact_constraints import Contact
-from perch_planner.cutting import turning_side
-from perch_planner.judgement import Judgement, Question
+from perch_planner.cutting import turn_direction
 from perch_planner.plan_checks import BODY_RATE, HEIGHT, HOLDS, MAXIMUM, MINIMUM, SPEED
+from perch_planner.plan_evaluation import PlanCheck, PlanLimits
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.rotor_thrusts import rotor_model
 from perch_planner.segment_program import COST_ORDER, SegmentProgram
 from perch_planner.time_allocation import (
-    FINE, LAST_SEGMENT_MIN, allocate, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
+    FINE_DIVISIONS, LAST_SEGMENT_MIN, allocate, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
 from perch_planner.yaw_profile import yaw_coefficients
 
 ITERATIONS_MAX = 100  # quadratic programs of a search
 _CUT_ROUNDS = 24
-_PATIENCE = 5         # so often, peaks are stretched where a longer time helps most: high ones, and those before the last waypoint
-_NEAR = 0.03          # violations of the thrust range below this share are cut together with the other limits
-_PLAIN_STRETCH = 1.15
+_EARLY_STRETCHES = 5      # so often, peaks are stretched where a longer time helps most: high ones, and those before the last waypoint
+_SMALL_VIOLATION = 0.03   # violations of the thrust range below this share are cut together with the other limits
+_DEFAULT_STRETCH = 1.15
 _BISECTIONS = 12
-_COARSE = 3           # so many durations are tried with few last pieces first, which cost least; from the last of them on with all divisions
-_STEPS = 6            # so often the approach becomes a quarter longer,
-_GROWTH = (1.25, 1.6)  # then by more
+_COARSE_TRIALS = 3        # so many durations are tried with few last pieces first, which cost least; from the last of them on with all divisions
+_SMALL_STEPS = 6          # so often the approach becomes a quarter longer, then by more
+_APPROACH_GROWTH = (1.25, 1.6)
 
 
 class Attempt(NamedTuple):
@@ -55,18 +55,18 @@ class Outcome(NamedTuple):
     yaw: np.ndarray = np.empty((0, 15))
     results: np.ndarray = np.empty((0, 5))
     proved: bool = False
-    stretch: float = _PLAIN_STRETCH
+    stretch: float = _DEFAULT_STRETCH
     extrema: np.ndarray | None = None
 
 
-def turn(fails: int) -> int:
-    """Index in `FINE` of the division of the approach to try after `fails` failures; len(FINE): the coarse division."""
-    return len(FINE) if fails < _COARSE else (fails - _COARSE) % (len(FINE) + 1)
+def division_index(fails: int) -> int:
+    """Index in `FINE_DIVISIONS` of the division of the approach to try after `fails` failures; their number: the coarse division."""
+    return len(FINE_DIVISIONS) if fails < _COARSE_TRIALS else (fails - _COARSE_TRIALS) % (len(FINE_DIVISIONS) + 1)
 
 
-def divided(durations: np.ndarray, fails: int) -> np.ndarray:
+def divided_durations(durations: np.ndarray, fails: int) -> np.ndarray:
     """Durations of the segments to try after `fails` divisions of the approach have failed [s]."""
-    return split_last(durations) if turn(fails) == len(FINE) else split_finely(durations, FINE[turn(fails)])
+    return split_last(durations) if division_index(fails) == len(FINE_DIVISIONS) else split_finely(durations, FINE_DIVISIONS[division_index(fails)])
 
 
 class Search:
@@ -78,78 +78,78 @@ class Search:
         self.problem, self.settings, self.vehicle, self.limits = problem, settings, vehicle, limits
         self.low, self.high = limits.thrust[0] / vehicle.mass, limits.thrust[1] / vehicle.mass
         self.contact = Contact(problem, settings, vehicle.perch_offset)
-        self.first = allocate(problem, settings, self.contact.points)
+        self.initial_durations = allocate(problem, settings, self.contact.points)
         self.end_yaw = contact_heading(problem.surface)
-        self.question = Question(
-            problem.surface.p_WS, problem.target_velocity, problem.surface.normal.copy(), turning_side(self.end_yaw), self.low,
-            self.high, limits.speed, *limits.height, limits.extension, limits.clearance, limits.body_rate, _NEAR * self.high,
+        self.plan_limits = PlanLimits(
+            problem.surface.p_WS, problem.target_velocity, problem.surface.normal.copy(), turn_direction(self.end_yaw), self.low,
+            self.high, limits.speed, *limits.height, limits.extension, limits.clearance, limits.body_rate, _SMALL_VIOLATION * self.high,
             len(problem.waypoints))
         self.rotors = (*limits.rotor_thrust, *rotor_model(vehicle))
         self.attempts: list[Attempt] = []
-        self.acted = {"tangential_speed_max", "clearance_min"}
+        self.active_limits = {"tangential_speed_max", "clearance_min"}
         """Settings whose limits influenced the search: those in the rows of every program, and those that plans violated."""
 
     @property
     def iterations(self) -> int:
         return len(self.attempts)
 
-    def try_durations(self, durations: np.ndarray, patient: bool = False) -> Outcome:
+    def try_durations(self, durations: np.ndarray, allow_stretch: bool = False) -> Outcome:
         """Solve and cut for fixed durations until every limit is proved or cuts do not help.
 
         Args:
             durations: [s], shape (f,).
-            patient: stop early where longer durations promise more than cuts.
+            allow_stretch: stop early where longer durations promise more than cuts.
         """
         settings, start = self.settings, self.problem.start
-        nothing = Outcome(durations)
+        no_plan = Outcome(durations)
         yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
                                COST_ORDER[settings.objective])
         try:
-            program = SegmentProgram(self.contact, durations, settings, yaw, self.question, self.rotors)
+            program = SegmentProgram(self.contact, durations, settings, yaw, self.plan_limits, self.rotors)
         except np.linalg.LinAlgError:
-            return nothing
+            return no_plan
         best, count, duration = None, 0, float(durations.sum())
         for rounds in range(_CUT_ROUNDS + 1):
             if rounds and self.iterations >= self._iterations_max:
                 break
-            found = program.judged(patient, rounds > 0)
-            if found is None:
-                self._note(duration, np.nan, np.nan, count)
+            check = program.solve_and_check(allow_stretch, rounds > 0)
+            if check is None:
+                self._record_attempt(duration, np.nan, np.nan, count)
                 break
-            self._note(duration, found.least, found.most, count)
-            if found.holds and found.kept:
-                return Outcome(durations, found.coefficients, yaw, found.results, True)
-            self._remember(found)
-            outcome = self._thrust(durations, found)
-            if outcome and found.stretch:
+            self._record_attempt(duration, check.thrust_min, check.thrust_max, count)
+            if check.holds and check.rotors_hold:
+                return Outcome(durations, check.coefficients, yaw, check.results, True)
+            self._record_violations(check)
+            outcome = self._thrust_violation(durations, check)
+            if outcome and check.stretch:
                 return outcome
-            count += found.cuts + found.near
-            if found.checked and not outcome:
-                outcome = Outcome(durations, found.coefficients, yaw, found.results)
+            count += check.cuts + check.rotor_bounds
+            if check.checked and not outcome:
+                outcome = Outcome(durations, check.coefficients, yaw, check.results)
             best = outcome
-            if not (found.cuts or program.turning):
+            if not (check.cuts or program.rotor_limits_active):
                 break
-        # After cuts the peak says nothing about a longer plan: the next one is only a little longer.
-        return best._replace(stretch=_PLAIN_STRETCH) if best and count else best or nothing
+        # After cuts the peak does not predict that of a longer plan: the next one is only a little longer.
+        return best._replace(stretch=_DEFAULT_STRETCH) if best and count else best or no_plan
 
-    def _thrust(self, durations: np.ndarray, found: Judgement) -> Outcome | None:
+    def _thrust_violation(self, durations: np.ndarray, check: PlanCheck) -> Outcome | None:
         """Return the outcome where the thrust leaves its range, else None."""
-        if found.most <= self.high and found.least >= self.low:
+        if check.thrust_max <= self.high and check.thrust_min >= self.low:
             return None
-        return Outcome(durations, found.coefficients, stretch=stretch_factor(found.most, self.high), extrema=found.extrema)
+        return Outcome(durations, check.coefficients, stretch=stretch_factor(check.thrust_max, self.high), extrema=check.extrema)
 
-    def _note(self, duration: float, least: float, most: float, cuts: int) -> None:
+    def _record_attempt(self, duration: float, least: float, most: float, cuts: int) -> None:
         mass = self.vehicle.mass
         self.attempts.append(Attempt(duration, mass * least, mass * most, cuts))
 
-    def _remember(self, found: Judgement) -> None:
+    def _record_violations(self, check: PlanCheck) -> None:
         """Record which limits a plan violates."""
-        left = {"thrust_min": found.least < self.low, "thrust_max": found.most > self.high, "rotor_margin": not found.kept}
-        if found.checked:
-            results, (floor, ceiling) = found.results, self.limits.height
-            left |= {"speed_max": not results[SPEED, HOLDS], "body_rate_max": not results[BODY_RATE, HOLDS],
-                     "height_min": results[HEIGHT, MINIMUM] < floor, "height_max": results[HEIGHT, MAXIMUM] > ceiling}
-        self.acted |= {name for name, left_it in left.items() if left_it}
+        violated = {"thrust_min": check.thrust_min < self.low, "thrust_max": check.thrust_max > self.high, "rotor_margin": not check.rotors_hold}
+        if check.checked:
+            results, (floor, ceiling) = check.results, self.limits.height
+            violated |= {"speed_max": not results[SPEED, HOLDS], "body_rate_max": not results[BODY_RATE, HOLDS],
+                         "height_min": results[HEIGHT, MINIMUM] < floor, "height_max": results[HEIGHT, MAXIMUM] > ceiling}
+        self.active_limits |= {name for name, is_violated in violated.items() if is_violated}
 
     def run(self) -> tuple[np.ndarray, Outcome]:
         """Lengthen durations until every limit is proved, or the time or the number of programs is exhausted. [M:IV-C.3]
@@ -158,25 +158,25 @@ class Search:
         third try on only after all its divisions failed. Longer durations are shortened to `duration_max` once, and tried with
         all divisions.
         """
-        durations, best, stretched, fails, last = self.first, None, 0, 0, False
+        durations, best, stretched, fails, at_maximum = self.initial_durations, None, 0, 0, False
         while True:
             if durations.sum() > self.settings.duration_max:
-                self.acted.add("duration_max")
-                within = None if last else shortened(durations, self.settings)
-                if within is None:
+                self.active_limits.add("duration_max")
+                fitted = None if at_maximum else shortened(durations, self.settings)
+                if fitted is None:
                     return durations, best or Outcome(durations)
-                durations, last, fails = within, True, max(fails, _COARSE - 1)
-            outcome = self.try_durations(divided(durations, fails), patient=stretched < _PATIENCE)
+                durations, at_maximum, fails = fitted, True, max(fails, _COARSE_TRIALS - 1)
+            outcome = self.try_durations(divided_durations(durations, fails), allow_stretch=stretched < _EARLY_STRETCHES)
             if outcome.proved:
                 return durations, outcome
             if best is None or len(outcome.results):
                 best = outcome
             if self.fails_early(durations, outcome):
                 grown, stretched = outcome.stretch * durations, stretched + 1
-            elif turn(fails := fails + 1) < len(FINE):
-                grown = durations  # these, divided otherwise
+            elif division_index(fails := fails + 1) < len(FINE_DIVISIONS):
+                grown = durations  # the same, with another division
             else:
-                grown, stretched = lengthen_approach(durations, _GROWTH[stretched >= _STEPS]), stretched + 1
+                grown, stretched = lengthen_approach(durations, _APPROACH_GROWTH[stretched >= _SMALL_STEPS]), stretched + 1
             if self.iterations >= self._iterations_max:
                 return durations, best
             durations = with_last_segment(grown, self.settings)

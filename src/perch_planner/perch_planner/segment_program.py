@@ -10,8 +10,8 @@ from perch_core.arrays import Array, Indices
 from perch_core.jit import compiled
 from perch_planner import solvers
 from perch_planner.contact_constraints import Contact, conditions
-from perch_planner.judgement import Judgement, Question, judge
 from perch_planner.plan_checks import ROTOR_THRUST
+from perch_planner.plan_evaluation import PlanCheck, PlanLimits, check_plan
 from perch_planner.problem import PerchSettings
 from perch_planner.reduced_qp import ProgramArrays, assemble, coefficients
 from perch_planner.reduced_rows import Rows, rows_of, stacked
@@ -31,46 +31,47 @@ def _prepare(durations: Array, yaw: Array, velocity: Array, problem: tuple[Any, 
 
 
 @compiled
-def _carried(keys: Indices, dual: Array, to: Indices) -> Array:
+def _transfer_multipliers(keys: Indices, dual: Array, new_keys: Indices) -> Array:
     """Transfer multipliers of rows with ascending keys to rows with other ascending keys; zero for new keys."""
-    out, i = np.zeros(len(to)), 0
-    for k in range(len(to)):
-        while i < len(keys) and keys[i] < to[k]:
+    out, i = np.zeros(len(new_keys)), 0
+    for k in range(len(new_keys)):
+        while i < len(keys) and keys[i] < new_keys[k]:
             i += 1
-        if i < len(keys) and keys[i] == to[k]:
+        if i < len(keys) and keys[i] == new_keys[k]:
             out[k] = dual[i]
     return out
 
 
 @compiled
-def _judged(program: ProgramArrays, rows: Rows, keys: Indices, w: Array, dual: Array, yaw: Array, heading: Array,
-            question: tuple[Any, ...], rotors: Rotors, patient: bool, later: bool, turning: bool) -> tuple[tuple[Any, ...], Rows, Indices, Array]:
+def _next_program(program: ProgramArrays, rows: Rows, keys: Indices, w: Array, dual: Array, yaw: Array, heading: Array,
+                  plan_limits: tuple[Any, ...], rotors: Rotors, allow_stretch: bool, after_first: bool, rotor_limits_active: bool
+                  ) -> tuple[tuple[Any, ...], Rows, Indices, Array]:
     """Evaluate the plan of a solution, and build the next program.
 
     Args:
         program: of `reduced_qp.assemble`.
         rows: of the solved program; the last ones, one for each of `keys`, are valid near its plan only.
         w, dual: its solution.
-        yaw, heading, question, rotors, patient, later: as for `judgement.judge`.
-        turning: an earlier plan did not keep the rotor range.
+        yaw, heading, plan_limits, rotors, allow_stretch, after_first: as for `plan_evaluation.check_plan`.
+        rotor_limits_active: an earlier plan did not keep the rotor range.
 
     Returns:
-        (fields of `Judgement`, rows and keys of the next program, multipliers for its warm start).
+        (fields of `PlanCheck`, rows and keys of the next program, multipliers for its warm start).
     """
     plan = coefficients(program, w)
-    extrema, results, found, thrust, other, thrusts = judge(plan, yaw, heading, program[0], question, rotors, patient, later)
-    fixed, cuts, kept = len(dual) - len(keys), 0, found[3]
-    always, near = (rows[0][:fixed], rows[1][:fixed], rows[2][:fixed]), (rows[0][fixed:], rows[1][fixed:], rows[2][fixed:])
+    extrema, results, found, thrust, other, thrusts = check_plan(plan, yaw, heading, program[0], plan_limits, rotors, allow_stretch, after_first)
+    fixed, cuts, rotors_hold = len(dual) - len(keys), 0, found[3]
+    permanent, local = (rows[0][:fixed], rows[1][:fixed], rows[2][:fixed]), (rows[0][fixed:], rows[1][fixed:], rows[2][fixed:])
     for bounds in (thrust, other):
         if len(bounds[-1]):
-            always = stacked(always, rows_of(program, bounds))
+            permanent = stacked(permanent, rows_of(program, bounds))
             cuts += len(bounds[-1])
-    to, count = keys, 0
-    if len(thrusts) and (turning or not kept) and not (kept and found[4]):
-        to, near = rotor_rows(program, thrusts, results[ROTOR_THRUST], plan, heading, *rotors)
-        count = len(to)
-    start = np.concatenate((dual[:fixed], np.zeros(cuts), _carried(keys, dual[fixed:], to)))
-    return (plan, extrema, results, *found, cuts, count), stacked(always, near), to, start
+    new_keys, count = keys, 0
+    if len(thrusts) and (rotor_limits_active or not rotors_hold) and not (rotors_hold and found[4]):
+        new_keys, local = rotor_rows(program, thrusts, results[ROTOR_THRUST], plan, heading, *rotors)
+        count = len(new_keys)
+    start = np.concatenate((dual[:fixed], np.zeros(cuts), _transfer_multipliers(keys, dual[fixed:], new_keys)))
+    return (plan, extrema, results, *found, cuts, count), stacked(permanent, local), new_keys, start
 
 
 class SegmentProgram:
@@ -78,33 +79,33 @@ class SegmentProgram:
 
     Args:
         contact, durations, settings: of the program.
-        yaw, question, rotors: as for `judgement.judge`.
+        yaw, plan_limits, rotors: as for `plan_evaluation.check_plan`.
     """
 
-    def __init__(self, contact: Contact, durations: Array, settings: PerchSettings, yaw: Array, question: Question, rotors: Rotors) -> None:
-        self._solver, self._question, self._rotors, cost_order = settings.solver, tuple(question), rotors, COST_ORDER[settings.objective]
+    def __init__(self, contact: Contact, durations: Array, settings: PerchSettings, yaw: Array, plan_limits: PlanLimits, rotors: Rotors) -> None:
+        self._solver, self._plan_limits, self._rotors, cost_order = settings.solver, tuple(plan_limits), rotors, COST_ORDER[settings.objective]
         program, self._rows, heading = _prepare(durations, yaw, contact.velocity, contact.problem, settings.objective == "jerk",
                                                 GRAMS[cost_order], cost_order)
         self._program: ProgramArrays = (durations, *program)
         self._yaw, self._heading = yaw, heading
-        self._keys: Indices = np.empty(0, np.int64)  # of rows that hold near the present plan alone
+        self._keys: Indices = np.empty(0, np.int64)  # of rows that hold near the present plan only
         self._dual: Array | None = None
-        self.turning = False
+        self.rotor_limits_active = False
         """Whether a plan of this program did not keep the rotor range."""
 
-    def judged(self, patient: bool, later: bool) -> Judgement | None:
+    def solve_and_check(self, allow_stretch: bool, after_first: bool) -> PlanCheck | None:
         """Solve, check the plan and add the bounds that were found; None where the program has no solution.
 
         Args:
-            patient, later: as for `judgement.judge`.
+            allow_stretch, after_first: as for `plan_evaluation.check_plan`.
         """
         solution = solvers.least_norm(*self._rows, self._solver, self._dual)
         if not solution.solved:
             return None
         dual = np.zeros(len(self._rows[1])) if solution.dual is None else solution.dual
-        fields, self._rows, self._keys, self._dual = _judged(
-            self._program, self._rows, self._keys, solution.w, dual, self._yaw, self._heading, self._question, self._rotors, patient, later,
-            self.turning)
-        found = Judgement(*fields)
-        self.turning = self.turning or not found.kept
-        return found
+        fields, self._rows, self._keys, self._dual = _next_program(
+            self._program, self._rows, self._keys, solution.w, dual, self._yaw, self._heading, self._plan_limits, self._rotors, allow_stretch,
+            after_first, self.rotor_limits_active)
+        check = PlanCheck(*fields)
+        self.rotor_limits_active = self.rotor_limits_active or not check.rotors_hold
+        return check

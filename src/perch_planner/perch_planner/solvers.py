@@ -18,7 +18,7 @@ from perch_core.jit import compiled
 FEASIBILITY = 1e-6
 """Largest violation of a row of unit length that counts as solved."""
 _TOLERANCE = 1e-9  # of a row, for DAQP
-_LONGEST = _TOLERANCE / np.finfo(float).eps  # |w| for which the rounding of a row exceeds it
+_NORM_MAX = _TOLERANCE / np.finfo(float).eps  # |w| for which the rounding of a row exceeds it
 
 
 class Solution(NamedTuple):
@@ -66,7 +66,7 @@ def _daqp(rows: Array, lower: Array, upper: Array, dual: Array | None) -> tuple[
     # Without a cost matrix and vector DAQP takes the unit matrix and zero.
     # Its dual objective bounds |w|^2 / 2 from below, and grows without end where no w exists: half of the iterations are saved.
     w, _, flag, found = daqp.solve(None, None, rows, upper, lower, np.zeros(len(lower), np.int32), dual_start=dual,
-                                   primal_tol=_TOLERANCE, fval_bound=0.5 * _LONGEST**2)
+                                   primal_tol=_TOLERANCE, fval_bound=0.5 * _NORM_MAX**2)
     return np.asarray(w), "solved" if flag == 1 else f"exit flag {flag}", np.asarray(found["lam"])
 
 
@@ -109,5 +109,5 @@ def least_norm(rows: Array, lower: Array, upper: Array, solver: str = "daqp", du
     residual = _residual(rows, lower, upper, w) if w.shape == rows.shape[1:] else np.inf
     if residual == np.inf:
         return Solution(np.zeros(rows.shape[1]), False, np.inf, status)
-    # A solver that says "infeasible" is not overruled by a residual; one that says "solved" is.
+    # A solver that reports "infeasible" is not overruled by a residual; one that reports "solved" is.
     return Solution(w, status.lower() == "solved" and residual <= FEASIBILITY, residual, status, found)

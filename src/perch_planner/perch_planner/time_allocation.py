@@ -15,7 +15,7 @@ CRUISE_SPEED = 2.2        # [m/s] of the speed profile that spaces the waypoints
 CRUISE_ACCELERATION = 2.8  # [m/s^2]
 TURN_ACCELERATION = 1.2    # [m/s^2]
 FINAL_TIME = 0.45          # [s] of the last piece, where the rotation happens
-FINE = (np.array([0.26, 0.2, 0.2]), np.array([0.375, 0.25]))  # [s] last pieces where the rotation takes all that the rotors have
+FINE_DIVISIONS = (np.array([0.26, 0.2, 0.2]), np.array([0.375, 0.25]))  # [s] last pieces where the rotation takes all that the rotors have
 PIECE_MAX = 1.8           # [s] of the pieces before it
 APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
@@ -29,7 +29,7 @@ def _distance(a: Array, b: Array) -> float:
 
 
 @compiled
-def _turn(points: Array, legs: Array, i: int) -> float:
+def _direction_change(points: Array, legs: Array, i: int) -> float:
     """Length of the difference between the directions of legs i and i + 1."""
     squared = 0.0
     for d in range(3):
@@ -39,7 +39,7 @@ def _turn(points: Array, legs: Array, i: int) -> float:
 
 @compiled
 def _along_waypoints(points: Array, v_start: Array, v_end: Array, speed: float, acceleration: float, turn_acceleration: float,
-                     last_least: float) -> Array:
+                     last_min: float) -> Array:
     """Durations between points, from a trapezoidal speed profile over the whole way.
 
     The profile is slowed down for the turns and lengthened for the difference of the end velocities. The speed at a waypoint
@@ -63,14 +63,14 @@ def _along_waypoints(points: Array, v_start: Array, v_end: Array, speed: float, 
         now = near if reached <= 0.5 * length else total - near
         fast = speed
         if i < n - 1:
-            turn = _turn(points, legs, i)
+            turn = _direction_change(points, legs, i)
             fast = min(np.sqrt(turn_acceleration * min(legs[i], legs[i + 1]) / max(turn, 1e-6)), speed)
         out[i] = max(now - before, 2.0 * legs[i] / (slow + fast))
         before, slow = now, fast
     stretch = 1.0 + extra / out.sum()
     for i in range(n):
         out[i] = max(stretch * out[i], SEGMENT_MIN)
-    out[n - 1] = max(max(out[n - 1], APPROACH_TIME), last_least)
+    out[n - 1] = max(max(out[n - 1], APPROACH_TIME), last_min)
     return out
 
 

@@ -97,7 +97,7 @@ Axes = tuple[Array, Array, Array]
 class Equal(Protocol):
     """Records a finding where a value differs from the required one."""
 
-    def __call__(self, name: str, value: Any, wanted: Array, t: float, slack: float = 1.0) -> None: ...
+    def __call__(self, name: str, value: Any, expected: Array, t: float, slack: float = 1.0) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -192,9 +192,9 @@ def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 
     begins = np.concatenate([[0.0], np.cumsum([piece.duration for piece in pieces])])
     end = float(begins[-1])
 
-    def equal(name: str, value: Any, wanted: Array, t: float, slack: float = 1.0) -> None:
-        excess = float(np.abs(np.asarray(value) - wanted).max())
-        if not excess <= _TOLERANCE * slack * (1.0 + float(np.abs(wanted).max())):
+    def equal(name: str, value: Any, expected: Array, t: float, slack: float = 1.0) -> None:
+        excess = float(np.abs(np.asarray(value) - expected).max())
+        if not excess <= _TOLERANCE * slack * (1.0 + float(np.abs(expected).max())):
             found.append(Finding(name, excess, t))
 
     def at_most(name: str, value: float, limit: float, t: float, slack: float) -> None:
@@ -217,8 +217,8 @@ def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 
 
 
 def _check_knots(pieces: list[_Segment], begins: Array, need: Requirements, equal: Equal) -> None:
-    for order, wanted in enumerate(need.start):
-        equal(f"start, derivative {order} [M:eq6]", pieces[0].at([0.0], order)[0, :3], wanted, 0.0, slack=10.0**order)
+    for order, expected in enumerate(need.start):
+        equal(f"start, derivative {order} [M:eq6]", pieces[0].at([0.0], order)[0, :3], expected, 0.0, slack=10.0**order)
     equal("start yaw", pieces[0].at([0.0], 0)[0, 3], np.array(need.start_yaw[0]), 0.0)
     equal("start yaw rate", pieces[0].at([0.0], 1)[0, 3], np.array(need.start_yaw[1]), 0.0, slack=10.0)
     for k in range(len(pieces) - 1):
@@ -229,10 +229,10 @@ def _check_knots(pieces: list[_Segment], begins: Array, need: Requirements, equa
         equal(f"waypoint {k} [M:eq6]", pieces[k].at([1.0], 0)[0, :3], waypoint, float(begins[k + 1]))
 
 
-def _check_impact(v: Array, later: Array, need: Requirements, end: float, at_most: AtMost) -> None:
-    """Check speed and slip of a contact on time, and of one after a velocity change `later` where the bounds permit both."""
+def _check_impact(v: Array, velocity_change: Array, need: Requirements, end: float, at_most: AtMost) -> None:
+    """Check speed and slip of a contact on time, and of one after `velocity_change` where the bounds permit both."""
     axes, (least, most) = np.array([-need.s3, need.s1, need.s2]), need.impact_speed
-    on_time, change = axes @ v, axes @ later
+    on_time, change = axes @ v, axes @ velocity_change
     slide = float(np.hypot(*change[1:]))
     speeds, slips = [float(on_time[0])], [float(np.hypot(*on_time[1:]))]
     if abs(change[0]) < most - least:

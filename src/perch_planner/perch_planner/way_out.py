@@ -23,8 +23,8 @@ from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Outcome, Search
 
 DURATIONS = (1.2, 0.8, 1.8)  # [s]
-TURN = 0.3                   # of the first piece, where the vehicle turns back [s]
-AWAY = 0.5                   # least distance of the hover from the surface's plane when it is reached [m]
+TURN_TIME = 0.3              # of the first piece, where the vehicle turns back [s]
+STANDOFF_MIN = 0.5           # least distance of the hover from the surface's plane when it is reached [m]
 _CODES = {"body_rate": refusals.BODY_RATE, "thrust": refusals.THRUST_FLOOR, "rotor_thrust": refusals.THRUST_FLOOR}
 
 
@@ -45,8 +45,8 @@ def hover_place(problem: PerchProblem, limits: Limits, duration: float) -> np.nd
     """
     start, surface = problem.start, problem.surface
     place = start.p + duration * (start.v / 2.0 + duration * (start.a / 10.0 + duration * start.j / 120.0))
-    away = float((place - surface.p_WS - duration * problem.target_velocity) @ surface.normal)
-    place = place + max(AWAY - away, 0.0) * surface.normal
+    standoff = float((place - surface.p_WS - duration * problem.target_velocity) @ surface.normal)
+    place = place + max(STANDOFF_MIN - standoff, 0.0) * surface.normal
     place[2] = min(max(place[2], limits.height[0] + limits.extension), limits.height[1])
     return place
 
@@ -68,7 +68,7 @@ def plan_way_out(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
     begin, limits = perf_counter(), Limits.of(settings, vehicle)
     search = Search(problem, replace(settings, objective="jerk"), vehicle, limits)
     best: Outcome | None = None
-    for durations in [(T,) for T in DURATIONS] + [(TURN, T - TURN) for T in DURATIONS]:
+    for durations in [(T,) for T in DURATIONS] + [(TURN_TIME, T - TURN_TIME) for T in DURATIONS]:
         search.contact = _Hover(problem, settings, hover_place(problem, limits, sum(durations)))
         outcome = search.try_durations(np.array(durations))
         if outcome.proved:

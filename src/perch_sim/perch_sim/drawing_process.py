@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection
 import cv2
 import numpy as np
 
-from perch_core.processes import end_with_parent, give_way
+from perch_core.processes import end_with_parent, lower_priority
 from perch_sim.rendering import Renderer
 
 GREETING = b"ready"
@@ -33,7 +33,7 @@ def main() -> None:
     """Serve the pipes of orders and of images, whose numbers are on the command line."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller decides when this ends
     end_with_parent(signal.SIGTERM)
-    give_way(0, NICE)
+    lower_priority(0, NICE)
     cv2.setNumThreads(1)
     with suppress(EOFError, BrokenPipeError):
         draw_until_closed(Connection(int(sys.argv[1])), Connection(int(sys.argv[2])))

@@ -67,7 +67,7 @@ class ModelledVio(Component[VioModelParameters]):
             self._warned = True
             self.warn("vio_model is a stand-in: vio/odometry is the truth with drift and noise")
         if state.stamp <= self._newest:
-            self.warn("ground_truth/odometry: its stamps go back: begun anew", every=1.0)
+            self.warn("ground_truth/odometry: its stamps go back: begun anew", min_interval=1.0)
             self._begin()
         self._newest = state.stamp
         self._history.append(TrueState(state.stamp, np.array((*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B))))
@@ -78,7 +78,7 @@ class ModelledVio(Component[VioModelParameters]):
     def on_camera_info(self, model: CameraModel) -> None:
         """A frame, to be answered when the truth covers its exposure."""
         if not self._last_frame < model.stamp <= self._newest + LONGEST_AHEAD:
-            self.warn(f"camera_{CAMERA}/camera_info: a stamp goes back or is ahead of the truth: not used", every=1.0)
+            self.warn(f"camera_{CAMERA}/camera_info: a stamp goes back or is ahead of the truth: not used", min_interval=1.0)
             return
         self._last_frame = model.stamp
         self._frames.append(model.stamp)
@@ -92,7 +92,7 @@ class ModelledVio(Component[VioModelParameters]):
             try:
                 state = self._history.at(exposed)
             except LookupError as error:
-                self.warn(f"frame without truth: {error}", every=1.0)
+                self.warn(f"frame without truth: {error}", min_interval=1.0)
             else:
                 self._answers.append((exposed + self._latency, *self._estimate(state)))
 

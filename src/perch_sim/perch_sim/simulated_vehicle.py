@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from perch_core import so3
-from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Wake
+from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.errors import ConfigError, PerchError
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
@@ -51,7 +51,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
     motor_command = Input(MotorCommand, "motor_command", answered=True)
     rates_thrust = Input(RatesThrust, "rates_thrust_command", answered=True)
     attitude_thrust = Input(AttitudeThrust, "attitude_thrust_command", answered=True)
-    pace = Wake(CONTROL_PERIOD)
+    pace = Timer(CONTROL_PERIOD)
     imu = Output(ImuSample, "imu/data_raw")
     truth = Output(OdometryState, "ground_truth/odometry")
     target = Output(PoseStamped, "ground_truth/target")
@@ -186,7 +186,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
             for frame in fixed_frames(self.simulation.vehicle):
                 self.frames(frame)
         self.imu(ImuSample(time, tuple(output.imu.gyro.tolist()), tuple(output.imu.accel.tolist())))
-        if self.truth.wanted:
+        if self.truth.has_receivers:
             self.truth(true_odometry(output.state))
         for event in output.contacts:
             self._touch(event)
@@ -197,7 +197,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
     def _show_slow(self, index: int) -> None:
         plant, scenario = self.simulation.plant, self.scenario
         self.clock(self.time)
-        if self.rotors.wanted:
+        if self.rotors.has_receivers:
             self.rotors(RotorState(self.time, tuple(plant.rotor_speed.tolist()), tuple(plant.rotor_thrust.tolist())))
         if scenario.mode == "surface" and (index == 0 or any(scenario.target.velocity)):
             pad = self.simulation.pad
@@ -248,7 +248,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
         level, message = 0, "ok"
         if missed > COMMANDS_MISSED * steps:
             level, message = 1, f"{100 * missed / steps:.0f} % of the controller's commands are lost or late"
-            self.warn(message, every=5.0)
+            self.warn(message, min_interval=5.0)
         if simulation.motors.timed_out:
             level, message = 1, "motors stopped: no motor_command"
         if simulation.plant.crashed:

@@ -27,7 +27,7 @@ SPAN = 1.5  # the last part of the trajectory is flown [s]
 
 
 @compiled
-def flown(start, speed, table, gains, limits, narrow, window, lead, lag, period, vehicle):
+def simulate(start, speed, table, gains, limits, narrow, window, lead, lag, period, vehicle):
     """State at the end of a simulated flight of the geometric controller; see `GeometricController.end_on_model`."""
     state, command = start, speed
     duration, mass, J = len(table) * period, vehicle[0][0], vehicle[0][1:4]
@@ -45,13 +45,13 @@ def flown(start, speed, table, gains, limits, narrow, window, lead, lag, period,
         command = control_step(state, reference, speed, command, none, gains,
                                (limits[0], cone, limits[2], limits[3], limits[4]), lead, lag, vehicle)[0]
         f = thrusts(approached(speed, command, middle), coefficient)
-        felt = drag_compensation(state[6:10], state[3:6], vehicle[4], none)
-        state = predicted(state, f, felt, period, mass, J, vehicle[2])
+        compensation = drag_compensation(state[6:10], state[3:6], vehicle[4], none)
+        state = predicted(state, f, compensation, period, mass, J, vehicle[2])
         speed = approached(speed, command, share)
     return np.array(state)
 
 
-def miss(source: Source, controller: GeometricController) -> tuple[float, float]:
+def contact_error(source: Source, controller: GeometricController) -> tuple[float, float]:
     """Error of the law at the end of a trajectory on the vehicle model, simulated from the reference `SPAN` before the end on.
 
     Args:
@@ -64,11 +64,12 @@ def miss(source: Source, controller: GeometricController) -> tuple[float, float]
     T, period = source.duration, controller.period
     n = int(min(SPAN, T) / period)
     table = packed_many(source, T - n * period + np.arange(n) * period + controller.lag)
-    end, wanted = controller.end_on_model(*_on_reference(source.setpoint(T - n * period), controller.vehicle), table), source.setpoint(T)
+    start, rotors = _state_on_reference(source.setpoint(T - n * period), controller.vehicle)
+    end, wanted = controller.end_on_model(start, rotors, table), source.setpoint(T)
     return float(np.linalg.norm(end[0:3] - wanted.p)), float(np.linalg.norm(end[3:6] - wanted.v))
 
 
-def _on_reference(x: Setpoint, vehicle: Vehicle) -> tuple[np.ndarray, RotorEstimate]:
+def _state_on_reference(x: Setpoint, vehicle: Vehicle) -> tuple[np.ndarray, RotorEstimate]:
     """State and rotors of a vehicle that is exactly on a setpoint."""
     f = (x.a[0], x.a[1], x.a[2] + GRAVITY)
     b1, b2, b3, w, _ = commanded_frame(f, x.j, x.s, x.h, x.dh, x.ddh)

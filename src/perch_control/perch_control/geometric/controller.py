@@ -9,7 +9,7 @@ import numpy as np
 
 from perch_control.admission import TrajectoryRefused
 from perch_control.allocation import mixing_columns
-from perch_control.geometric.contact_check import flown, miss
+from perch_control.geometric.contact_check import contact_error, simulate
 from perch_control.geometric.step import control_step
 from perch_control.law import NO_COMPENSATION, ControlOutput, Law
 from perch_control.reference import Following, Source
@@ -92,13 +92,13 @@ class GeometricController(Law):
     def _limits(self, cone: float) -> tuple[float, ...]:
         return (FEEDBACK_MAX, cone, THRUST_FLOOR, self._rate_max, ACCELERATION_MAX)
 
-    def believe(self, vehicle: Vehicle) -> None:
+    def set_vehicle(self, vehicle: Vehicle) -> None:
         """Use a vehicle model that differs from the initial one in its thrust."""
         self.vehicle, self._vehicle = vehicle, packed_vehicle(vehicle)
 
     def check_contact(self, source: Source) -> None:
         """As `Law.check_contact`, by a simulation on the vehicle model (`contact_check.py`)."""
-        distance, speed = miss(source, self)
+        distance, speed = contact_error(source, self)
         if distance > CONTACT_MISS or speed > CONTACT_SPEED_MISS:
             raise TrajectoryRefused(f"on its model the geometric law misses the contact by {100 * distance:.1f} cm and {speed:.2f} m/s: "
                                     "the rotors cannot follow this plan; the NMPC (controller.type: nmpc) may fly it")
@@ -114,5 +114,5 @@ class GeometricController(Law):
         Returns:
             State at the contact, shape (13,).
         """
-        return flown(tuple(start.tolist()), rotors.speed, table, self._gains, self._limits(self._wide), self._narrow,
+        return simulate(tuple(start.tolist()), rotors.speed, table, self._gains, self._limits(self._wide), self._narrow,
                      CONTACT_WINDOW, self.gains.lead, self.lag, self.period, self._vehicle)

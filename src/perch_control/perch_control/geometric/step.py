@@ -112,8 +112,8 @@ def control_step(state, reference, speed, command, extra, gains, limits, lead, l
     coefficient, _, _, tau = vehicle[1]
     half = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * lag / tau)
     f_mid = thrusts(approached(speed, command, half), coefficient)
-    felt = drag_compensation(state[6:10], state[3:6], vehicle[4], extra)
-    ahead = predicted(state, f_mid, felt, lag, mass, J, vehicle[2])
+    with_drag = drag_compensation(state[6:10], state[3:6], vehicle[4], extra)
+    ahead = predicted(state, f_mid, with_drag, lag, mass, J, vehicle[2])
     # The wanted velocity, not the measured one: its noise would come back as thrust.
     extra = drag_compensation(ahead[6:10], reference[3:6], vehicle[4], extra)
     thrust, M, q_C, w_C, dw_C = geometric_step(ahead, reference, extra, gains, limits, J)

@@ -12,12 +12,12 @@ from perch_control.mission.values import State, Target
 from perch_control.period import NOMINAL_PERIOD
 
 WINDOW = 0.06  # time over which the specific force is averaged [s]
-UNBALANCED = 3.0  # largest difference between the mean specific force and gravity of a body at rest [m/s^2]
+IMBALANCE_MAX = 3.0  # largest difference between the mean specific force and gravity of a body at rest [m/s^2]
 SPEED = 0.5  # of a vehicle at rest, as estimated [m/s]
 TILT = np.radians(25.0)  # between b3 and the surface normal
 DISTANCE = 0.25  # from the localised pad's centre [m]
-_LEAST = 0.8  # what vibration and a wrong attitude make of a vehicle at rest [m/s^2]
-_LEAST_TILT = np.radians(8.0)  # what a grip and the attitude's estimate leave
+_IMBALANCE_MIN = 0.8  # least threshold of the imbalance: vibration and attitude errors cause less at rest [m/s^2]
+_TILT_MIN = np.radians(8.0)  # least tolerance of the tilt: the grip's play and attitude errors cause less
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -29,8 +29,8 @@ class AdhesionMonitor:
     A vehicle that adheres is carried by the surface: the specific force is `R_WB^T g e3`, whatever the motors do.
 
     At a small tilt the difference is smaller: at theta from the vertical, no thrust comes closer to the weight than g sin(theta)
-    (g beyond 90 degrees). So the threshold is half of that, between `_LEAST` and `UNBALANCED`, and the tolerance of the
-    alignment is at most half of the target's tilt (but `_LEAST_TILT` at least), so that a hover is not taken as aligned.
+    (g beyond 90 degrees). So the threshold is half of that, between `_IMBALANCE_MIN` and `IMBALANCE_MAX`, and the tolerance of
+    the alignment is at most half of the target's tilt (but `_TILT_MIN` at least), so that a hover is not taken as aligned.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class AdhesionMonitor:
         g_B = so3.quat_rotate(so3.quat_conjugate(q_WB), np.array([0.0, 0.0, GRAVITY]))
         return float(np.linalg.norm(np.mean(self._samples, axis=0) - g_B))
 
-    def fallen_off(self, state: State) -> bool:
+    def detached(self, state: State) -> bool:
         """Whether the vehicle has come off, with its motors off: the specific force is small, and the vehicle moves.
 
         While the vehicle swings in its attachment, the specific force may also be small for a moment; but the speed stays low.
@@ -72,14 +72,14 @@ class AdhesionMonitor:
         b3, s3 = so3.quat_rotate(state.q_WB, _UP), so3.quat_rotate(target.q_WS, _UP)
         return bool(
             np.linalg.norm(state.p_WB - target.p_WS) < DISTANCE
-            and so3.angle_between(b3, s3) < min(TILT, max(_LEAST_TILT, 0.5 * so3.angle_between(s3, _UP)))
+            and so3.angle_between(b3, s3) < min(TILT, max(_TILT_MIN, 0.5 * so3.angle_between(s3, _UP)))
             and np.linalg.norm(state.v_WB) < SPEED
-            and self.imbalance(state.q_WB) < min(UNBALANCED, max(_LEAST, 0.5 * _unbalanced_in_flight(b3))))
+            and self.imbalance(state.q_WB) < min(IMBALANCE_MAX, max(_IMBALANCE_MIN, 0.5 * _min_acceleration_in_flight(b3))))
 
     @staticmethod
-    def tells(state: State) -> bool:
+    def is_conclusive(state: State) -> bool:
         """Whether rest and flight can be distinguished at this attitude, since no vehicle hovers in it."""
-        return _unbalanced_in_flight(so3.quat_rotate(state.q_WB, _UP)) > 2.0 * _LEAST
+        return _min_acceleration_in_flight(so3.quat_rotate(state.q_WB, _UP)) > 2.0 * _IMBALANCE_MIN
 
 
 def _count(period: float) -> int:
@@ -87,6 +87,6 @@ def _count(period: float) -> int:
     return max(3, round(WINDOW / period))
 
 
-def _unbalanced_in_flight(b3: np.ndarray) -> float:
+def _min_acceleration_in_flight(b3: np.ndarray) -> float:
     """Least acceleration of a vehicle in flight with its thrust along b3 (3,): min over T >= 0 of |T b3 - g e3| [m/s^2]."""
     return GRAVITY * (float(np.hypot(b3[0], b3[1])) if b3[2] > 0.0 else 1.0)

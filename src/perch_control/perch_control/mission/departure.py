@@ -33,9 +33,9 @@ class Departure(MissionMachine):
     def _leaving(self, inputs: Inputs, outputs: Outputs) -> None:
         if inputs.plan is not None:
             self._fly(inputs, outputs, inputs.plan)
-        elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING) and self._asked_at is not None:
-            self._missed(inputs, "departing")
-        elif inputs.controller is ControllerState.TRACKING and self._asked_at is not None:
+        elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING) and self._requested_at is not None:
+            self._fail_attempt(inputs, "departing")
+        elif inputs.controller is ControllerState.TRACKING and self._requested_at is not None:
             pass
         elif inputs.controller is not ControllerState.ATTACHED:
             self._end(outputs, Result.REFUSED, f"not perched: the controller is {inputs.controller.name.lower()}")
@@ -43,9 +43,9 @@ class Departure(MissionMachine):
             why = inputs.controller_message if inputs.estimator_ready else "the estimator is not ready"
             self._end(outputs, Result.TIMEOUT, f"no departure within {self.settings.phase_timeout:g} s: {why}")
         elif inputs.estimator_ready and not self._no_plan and (wire := self._moves.wire) is not None:
-            if self._asked_at is None:
-                self._asked_at, outputs.query = inputs.time, self._way_out(inputs, wire)
-        elif inputs.estimator_ready and self._time_to_ask(inputs):
+            if self._requested_at is None:
+                self._requested_at, outputs.query = inputs.time, self._way_out(inputs, wire)
+        elif inputs.estimator_ready and self._should_request_arm(inputs):
             outputs.commands.append((Command.ARM, "departing"))
 
     def _way_out(self, inputs: Inputs, wire: Target) -> PlanQuery:
@@ -60,7 +60,7 @@ class Departure(MissionMachine):
         if isinstance(plan, Refusal):
             self.message = f"no plan to leave the wire: {plan.message}"
             outputs.commands.append((Command.ARM, "departing"))
-            self._no_plan, self._asked_at = True, inputs.time
+            self._no_plan, self._requested_at = True, inputs.time
             return
         outputs.perch, outputs.trajectory_id = plan.starting(inputs.time + LEAD), self._new_id()
 

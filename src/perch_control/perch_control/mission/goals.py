@@ -23,8 +23,9 @@ def problem_with(goal: PerchGoal, settings: MissionSettings) -> str:
         return problem
     if goal.search_frame and goal.search_frame != "map":
         return f"search_frame: {goal.search_frame!r} is not 'map'"
-    if said := limits.problem(goal if goal.search_frame else replace(goal, search_position=(0.0, 0.0, 0.0), search_attitude=(0.0, 0.0, 0.0, 1.0))):
-        return said
+    if problem := limits.problem(goal if goal.search_frame else
+                                 replace(goal, search_position=(0.0, 0.0, 0.0), search_attitude=(0.0, 0.0, 0.0, 1.0))):
+        return problem
     if goal.search_frame and goal.search_position[2] < 0.3:
         return f"search_position: height {goal.search_position[2]:g} m is below 0.3 m"
     return ""

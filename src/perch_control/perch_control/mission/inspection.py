@@ -36,13 +36,13 @@ class InspectionMission(LineMission):
         self._enter(Phase.INSPECTING, inputs.time, f"inspecting, {outputs.reference.duration:.1f} s")
 
     def _inspecting(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._lost(inputs, outputs):
+        if self._handle_fallback(inputs, outputs):
             return
         if inputs.trajectory_id == self._flown_id and inputs.controller is ControllerState.HOVERING:
             if inputs.time < self._inspected:
-                self._missed(inputs, f"inspection given up: {inputs.controller_message}")
+                self._fail_attempt(inputs, f"inspection given up: {inputs.controller_message}")
             else:
                 self._end(outputs, Result.PERCHED, f"inspected along {len(self.settings.places)} waypoints")
         elif inputs.time > self._inspected + self.settings.arming_timeout:
             outputs.commands.append((Command.HOVER, "the inspection does not end"))
-            self._missed(inputs, f"the inspection does not end: {inputs.controller_message}")
+            self._fail_attempt(inputs, f"the inspection does not end: {inputs.controller_message}")

@@ -12,7 +12,7 @@ from perch_core.values import PowerlineMap, seconds
 from perch_core.values.limits import PLAN_LINES_MAX
 from perch_control.mission.values import Goal, Target
 
-_REACH = 0.4  # a line that is farther from the goal's point is another one [m]
+_LINE_DISTANCE_MAX = 0.4  # a line that is farther from the goal's point is another one [m]
 
 
 def mapped_target(lines: PowerlineMap, goal: Goal, p_WB: np.ndarray) -> Target | None:
@@ -29,7 +29,7 @@ def mapped_target(lines: PowerlineMap, goal: Goal, p_WB: np.ndarray) -> Target |
     """
     segments = [mapped.segment for mapped in lines.lines]
     near = [(float(line.distance(goal.perch_point)), k) for k, line in enumerate(segments)]
-    if not near or min(near)[0] >= _REACH:
+    if not near or min(near)[0] >= _LINE_DISTANCE_MAX:
         return None
     chosen = min(near)[1]
     mapped, line = lines.lines[chosen], segments[chosen]

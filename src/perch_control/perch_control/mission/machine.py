@@ -10,9 +10,9 @@ import numpy as np
 
 from perch_core.values import PerchGoal, PowerlineMap
 from perch_control.mission.adhesion import AdhesionMonitor
-from perch_control.mission.moves import Look, Moves, Place
+from perch_control.mission.moves import Moves, Place, SearchPlace
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.usable_target import unusable
+from perch_control.mission.usable_target import unusable_reason
 from perch_control.mission.values import Command, ControllerState, Goal, Inputs, Outcome, Outputs, Phase, Result, Target
 
 SEARCH_RISE = 0.25              # height change of the search pattern [m]
@@ -35,8 +35,8 @@ class MissionMachine(ABC):
     """
 
     _goal: Goal  # from `start` on
-    unseen = "no target seen"
-    """Message while no target is seen."""
+    no_target_message = "no target detected"
+    """Message while no target is detected."""
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         """
@@ -54,12 +54,12 @@ class MissionMachine(ABC):
             Phase.RECOVERING: self._recovering}
         self._adhesion = AdhesionMonitor()
         self._since = self._entered_search = 0.0
-        self._seen_since: float | None = None
-        self._asked_at: float | None = None  # the controller to arm, or the planner for the way off a wire
+        self._target_since: float | None = None
+        self._requested_at: float | None = None  # when arming, or a way out from a wire, was requested last [s]
         self._ids = count(1) if ids is None else ids
         self._moves = Moves(settings) if moves is None else moves
 
-    # -- what a kind says --------------------------------------------------------------------------------------------
+    # -- defined by subclasses ---------------------------------------------------------------------------------------
 
     @property
     def legs(self) -> int:
@@ -81,7 +81,7 @@ class MissionMachine(ABC):
         """
         return pad
 
-    def pattern(self) -> list[Look]:
+    def pattern(self) -> list[SearchPlace]:
         """Places around the search hover (forward, left, up [m], turn [rad]), to find a pad that is out of view."""
         return [(np.array([0.0, 0.0, SEARCH_RISE]), 0.0), (np.zeros(3), SEARCH_TURN), (np.zeros(3), -SEARCH_TURN),
                 (np.array([0.0, 0.0, -SEARCH_RISE]), 0.0), (np.zeros(3), 0.0)]
@@ -128,7 +128,7 @@ class MissionMachine(ABC):
         if inputs.cancel and not self._cancelled:
             self._cancel(inputs, outputs)
         elif inputs.controller is ControllerState.FAILED and self.phase is not Phase.PERCHED:
-            self._end(outputs, Result.TRACKING_LOST, f"controller gave up: {inputs.controller_message}")
+            self._end(outputs, Result.TRACKING_LOST, f"controller failed: {inputs.controller_message}")
         else:
             self.phases[self.phase](inputs, outputs)
         return outputs
@@ -137,7 +137,7 @@ class MissionMachine(ABC):
 
     def _arming(self, inputs: Inputs, outputs: Outputs) -> None:
         if inputs.controller is ControllerState.ATTACHED:
-            self._end(outputs, Result.PERCHED_ALREADY, "the vehicle is perched; the service `depart` comes first")
+            self._end(outputs, Result.PERCHED_ALREADY, "the vehicle is perched; call the service `depart` first")
         elif inputs.controller in _FLYING and inputs.estimator_ready:
             self._go_to_search(inputs, outputs, "already flying: going to the search place")
         elif inputs.controller is ControllerState.ARMED:
@@ -146,48 +146,48 @@ class MissionMachine(ABC):
             outputs.commands.append((Command.DISARM, "arming took too long"))
             why = "the estimator is not ready" if not inputs.estimator_ready else inputs.controller_message
             self._end(outputs, Result.TIMEOUT, f"not armed within {self.settings.arming_timeout:g} s: {why}")
-        elif inputs.estimator_ready and self._time_to_ask(inputs):
+        elif inputs.estimator_ready and self._should_request_arm(inputs):
             outputs.commands.append((Command.ARM, "goal accepted"))
             self.message = "arming"
 
-    def _time_to_ask(self, inputs: Inputs) -> bool:
+    def _should_request_arm(self, inputs: Inputs) -> bool:
         """Whether to send the command to arm, for the first time or again: it may be lost, or refused while odometry is late."""
-        if self._asked_at is not None and inputs.time - self._asked_at < self.settings.ask_again:
+        if self._requested_at is not None and inputs.time - self._requested_at < self.settings.arm_retry_period:
             return False
-        self._asked_at = inputs.time
+        self._requested_at = inputs.time
         return True
 
     def _take_off(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._lost(inputs, outputs) or self._astray(inputs):
+        if self._handle_fallback(inputs, outputs) or self._handle_wrong_place(inputs):
             return
         if self._moves.arrived(inputs.time, inputs.state):
             self._enter(Phase.SEARCHING, inputs.time, "looking for the target")
 
     def _searching(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._lost(inputs, outputs) or self._astray(inputs):
+        if self._handle_fallback(inputs, outputs) or self._handle_wrong_place(inputs):
             return
-        if self._moves.looked < self.legs:
+        if self._moves.places_visited < self.legs:
             if self._moves.arrived(inputs.time, inputs.state):
-                self._go_on_looking(inputs, outputs, "mapping the lines")
+                self._go_to_next_search_place(inputs, outputs, "mapping the lines")
             return
         target, why = self._usable_now(inputs)
         if target is not None:
-            if self._seen_since is None:
-                self._seen_since = inputs.time
+            if self._target_since is None:
+                self._target_since = inputs.time
                 self.message = "target in view"
-            if inputs.time - self._seen_since >= self.settings.target_settle and self._moves.arrived(inputs.time, inputs.state):
+            if inputs.time - self._target_since >= self.settings.target_settle and self._moves.arrived(inputs.time, inputs.state):
                 self.at_target(inputs, outputs, target)
             return
-        self._seen_since = None
+        self._target_since = None
         if self._elapsed(inputs) > self._goal.search_timeout:
             self._end(outputs, Result.NOT_FOUND, f"no target within {self._goal.search_timeout:g} s: {why}")
             return
-        if self._moves.arrived(inputs.time, inputs.state) and self._moves.dwelt(inputs.time):
-            self._go_on_looking(inputs, outputs, f"looking for the target ({why})")
+        if self._moves.arrived(inputs.time, inputs.state) and self._moves.dwell_done(inputs.time):
+            self._go_to_next_search_place(inputs, outputs, f"looking for the target ({why})")
 
-    def _go_on_looking(self, inputs: Inputs, outputs: Outputs, message: str) -> None:
+    def _go_to_next_search_place(self, inputs: Inputs, outputs: Outputs, message: str) -> None:
         """Fly to the next place of the pattern."""
-        place = self._moves.next_look(self.pattern(), lambda offset, p: self.reach(offset, p, inputs.target))
+        place = self._moves.next_search_place(self.pattern(), lambda offset, p: self.reach(offset, p, inputs.target))
         self._go(inputs, outputs, place)
         self.message = message
 
@@ -195,7 +195,7 @@ class MissionMachine(ABC):
         resting = inputs.controller is ControllerState.HOVERING and self._moves.slow(inputs.state)
         if self.holds(inputs):
             self._contact_time = inputs.time
-            outputs.commands.append((Command.ATTACHED, "it holds all the same"))
+            outputs.commands.append((Command.ATTACHED, "contact detected during the recovery"))
             self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
             return
         if inputs.controller in (ControllerState.DISARMED, ControllerState.LANDING):
@@ -230,18 +230,18 @@ class MissionMachine(ABC):
     def _usable_now(self, inputs: Inputs) -> tuple[Target | None, str]:
         """Return the target where it is recent and certain enough to plan on; otherwise None, and the reason."""
         if inputs.target is None or inputs.target.time < self._entered_search:
-            return None, self.unseen
-        why = unusable(inputs.target, self._goal, self.settings)
+            return None, self.no_target_message
+        why = unusable_reason(inputs.target, self._goal, self.settings)
         return None if why else inputs.target, why
 
     # -- endings -----------------------------------------------------------------------------------------------------
 
-    def _lost(self, inputs: Inputs, outputs: Outputs) -> bool:
+    def _handle_fallback(self, inputs: Inputs, outputs: Outputs) -> bool:
         """Whether the phase was left, as the controller recovers or descends, or as the take-off takes too long."""
         if inputs.controller is ControllerState.RECOVERING:
-            self._gave_up(inputs, f"controller recovers: {inputs.controller_message}")
+            self._fail_without_retry(inputs, f"controller recovers: {inputs.controller_message}")
             return True
-        if self._descends(inputs, outputs):
+        if self._handle_descent(inputs, outputs):
             return True
         if self.phase is Phase.TAKE_OFF and self._elapsed(inputs) > self.settings.phase_timeout:
             outputs.commands.append((Command.LAND, "take-off took too long"))
@@ -249,26 +249,26 @@ class MissionMachine(ABC):
             return True
         return False
 
-    def _descends(self, inputs: Inputs, outputs: Outputs) -> bool:
+    def _handle_descent(self, inputs: Inputs, outputs: Outputs) -> bool:
         """End the goal where the controller lands or has landed; returns whether it does. The landing is not reversed."""
         if inputs.controller not in (ControllerState.LANDING, ControllerState.DISARMED):
             return False
         self._end(outputs, Result.TRACKING_LOST, f"controller descends: {inputs.controller_message}")
         return True
 
-    def _astray(self, inputs: Inputs) -> bool:
+    def _handle_wrong_place(self, inputs: Inputs) -> bool:
         """Recover where the controller hovers elsewhere than commanded, as it has left the move; returns whether it does."""
-        if inputs.controller is not ControllerState.HOVERING or not self._moves.astray(inputs.time, inputs.state):
+        if inputs.controller is not ControllerState.HOVERING or not self._moves.missed_destination(inputs.time, inputs.state):
             return False
-        self._gave_up(inputs, f"the controller gave up the way to the search place: {inputs.controller_message}")
+        self._fail_without_retry(inputs, f"the controller left the way to the search place: {inputs.controller_message}")
         return True
 
-    def _gave_up(self, inputs: Inputs, why: str) -> None:
+    def _fail_without_retry(self, inputs: Inputs, why: str) -> None:
         """Recover without a further attempt, as the controller has left the way to the target or was commanded to."""
         self._attempts_left = 1
-        self._missed(inputs, why)
+        self._fail_attempt(inputs, why)
 
-    def _missed(self, inputs: Inputs, why: str) -> None:
+    def _fail_attempt(self, inputs: Inputs, why: str) -> None:
         self._failure = why
         self._enter(Phase.RECOVERING, inputs.time, why)
 
@@ -285,7 +285,7 @@ class MissionMachine(ABC):
         else:
             if inputs.controller is not ControllerState.LANDING:
                 outputs.commands.append((Command.HOVER, "cancelled"))
-            self._missed(inputs, "cancelled")
+            self._fail_attempt(inputs, "cancelled")
 
     def _end(self, outputs: Outputs, result: Result, message: str, contact_time: float = float("nan")) -> None:
         outputs.outcome = Outcome(result, message, contact_time)
@@ -294,9 +294,9 @@ class MissionMachine(ABC):
     def _enter(self, phase: Phase, time: float, message: str) -> None:
         self.phase, self.message, self._since = phase, message, time
         if phase is Phase.ARMING:
-            self._asked_at, self._entered_search = None, time
+            self._requested_at, self._entered_search = None, time
         if phase is Phase.SEARCHING:
-            self._seen_since, self._moves.looked, self._entered_search = None, 0, time
+            self._target_since, self._moves.places_visited, self._entered_search = None, 0, time
 
     def _elapsed(self, inputs: Inputs) -> float:
         return inputs.time - self._since

@@ -18,7 +18,7 @@ TURN_RATE = 0.6   # mean yaw rate of a move [rad/s]
 
 Place = tuple[np.ndarray, float]
 """Position of a hover in W [m], shape (3,), and its yaw [rad]."""
-Look = tuple[np.ndarray, float]
+SearchPlace = tuple[np.ndarray, float]
 """A place around the search hover: forward, left, up [m], shape (3,), and a turn [rad]."""
 Reach = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -47,7 +47,7 @@ class Moves:
         self.wire: Target | None = None
         self.began = 0.0                  # when the last move was decided [s]
         self.length = 0.0                 # from then to its end [s]
-        self.looked = 0                   # places of the search pattern that were flown to
+        self.places_visited = 0           # number of places of the search pattern that were flown to
 
     def begin(self, goal: Goal, state: State, on_ground: bool) -> None:
         """Start the moves of a goal from the vehicle's state: armed on the ground, or in the air."""
@@ -63,15 +63,15 @@ class Moves:
         else:
             self.search = goal.search_position, goal.search_yaw if goal.search_yaw is not None else yaw
 
-    def next_look(self, pattern: Sequence[Look], reach: Reach) -> Place:
+    def next_search_place(self, pattern: Sequence[SearchPlace], reach: Reach) -> Place:
         """The next place of a pattern around the search hover.
 
         Args:
             pattern: the places.
             reach: shortens an offset (forward, left, up [m]), given the search place [m].
         """
-        offset, turn = pattern[self.looked % len(pattern)]
-        self.looked += 1
+        offset, turn = pattern[self.places_visited % len(pattern)]
+        self.places_visited += 1
         p, yaw = self.search
         return p + so3.exp(np.array([0.0, 0.0, yaw])) @ reach(offset, p), yaw + turn
 
@@ -86,17 +86,17 @@ class Moves:
 
     def arrived(self, time: float, state: State) -> bool:
         """Whether the last move has ended at least `settle_time` ago and the vehicle rests."""
-        return self._over(time) and self.slow(state)
+        return self._move_finished(time) and self.slow(state)
 
-    def astray(self, time: float, state: State) -> bool:
+    def missed_destination(self, time: float, state: State) -> bool:
         """Whether the last move has ended with the vehicle elsewhere: a plan from the hover would begin too far away."""
-        return self._over(time) and float(np.linalg.norm(state.p_WB - self.hover[0])) > START_GAP
+        return self._move_finished(time) and float(np.linalg.norm(state.p_WB - self.hover[0])) > START_GAP
 
-    def _over(self, time: float) -> bool:
+    def _move_finished(self, time: float) -> bool:
         """Whether the last move has ended at least `settle_time` ago."""
         return time > self.began + self.length + self.settings.settle_time
 
-    def dwelt(self, time: float) -> bool:
+    def dwell_done(self, time: float) -> bool:
         """Whether the vehicle has observed from this place for `search_dwell`."""
         return time - self.began > self.length + self.settings.search_dwell
 

@@ -13,9 +13,9 @@ from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
 
-TAKEN = 0.5       # a controller that still hovers so long after a plan's start has not taken it [s]
-TELL_AGAIN = 0.1  # between two messages to a controller that flies on although the vehicle is attached [s]
-_FLYING_ON = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerState.RECOVERING)
+ACCEPTANCE_TIMEOUT = 0.5  # a controller that still hovers so long after a plan's start has not accepted it [s]
+ATTACHED_RETRY = 0.1      # period of the command ATTACHED while the controller still flies although the vehicle is attached [s]
+_IN_FLIGHT = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerState.RECOVERING)
 
 
 class InFlight(Protocol):
@@ -34,19 +34,19 @@ R = TypeVar("R", bound=InFlight)
 class PerchingMission(MissionMachine, Generic[R]):
     """Common part of perches on surfaces and on wires. R: type of the plan in flight."""
 
-    _target: Target      # from the query on
-    _running: R          # from the first trajectory on
-    _first_id: int       # of an attempt's first trajectory; ids grow
-    _first_start: float  # when that starts [s]
-    _told_at: float      # that the vehicle is attached [s]
-    _off = False         # the vehicle came off after the motors had stopped
+    _target: Target           # from the query on
+    _running: R               # from the first trajectory on
+    _first_id: int            # of an attempt's first trajectory; ids grow
+    _first_start: float       # when that starts [s]
+    _attached_sent_at: float  # time of the last command ATTACHED [s]
+    _detached = False         # the vehicle came off after the motors had stopped
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         super().__init__(settings, ids, moves)
         self.phases |= {Phase.PLANNING: self._planning, Phase.TRACKING: self._tracking, Phase.VERIFYING: self._verifying,
                         Phase.PERCHED: self._perched}
 
-    # -- what a kind says --------------------------------------------------------------------------------------------
+    # -- defined by subclasses ---------------------------------------------------------------------------------------
 
     @property
     @abstractmethod
@@ -58,20 +58,20 @@ class PerchingMission(MissionMachine, Generic[R]):
         """Return a plan and its target as a plan in flight."""
 
     @abstractmethod
-    def better(self, inputs: Inputs, outputs: Outputs) -> None:
+    def update_plan(self, inputs: Inputs, outputs: Outputs) -> None:
         """Update the running plan as the target estimate improves, and request new plans and ways out."""
 
-    def waiting(self, inputs: Inputs, outputs: Outputs) -> bool:
+    def contact_awaited(self, inputs: Inputs, outputs: Outputs) -> bool:
         """Whether the contact is still awaited."""
         return inputs.time <= self._running.plan.end + self.settings.contact_time + 0.2
 
-    def not_held(self, outputs: Outputs) -> None:
+    def on_no_contact(self, outputs: Outputs) -> None:
         """Act on a contact that was not detected."""
 
     def holds(self, inputs: Inputs) -> bool:
         """Whether an abandoned perch holds the vehicle after all, as the contact or the abort was late."""
         return (self._flown_id > 0 and -self.settings.contact_early < inputs.time - self._running.plan.end < 1.0
-                and self._adhesion.tells(inputs.state) and self._adhesion.attached(inputs.state, self._running.target))
+                and self._adhesion.is_conclusive(inputs.state) and self._adhesion.attached(inputs.state, self._running.target))
 
     # -- phases ------------------------------------------------------------------------------------------------------
 
@@ -84,7 +84,7 @@ class PerchingMission(MissionMachine, Generic[R]):
         self._enter(Phase.PLANNING, inputs.time, "planning")
 
     def _planning(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._lost(inputs, outputs):
+        if self._handle_fallback(inputs, outputs):
             return
         if inputs.plan is None:
             if self._elapsed(inputs) > self.settings.phase_timeout:
@@ -101,18 +101,18 @@ class PerchingMission(MissionMachine, Generic[R]):
     def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
         end = self._running.plan.end
         self.time_to_contact = end - inputs.time
-        if self._descends(inputs, outputs):
+        if self._handle_descent(inputs, outputs):
             return
         hovers = inputs.controller is ControllerState.HOVERING
         if inputs.controller is ControllerState.RECOVERING or hovers and inputs.trajectory_id >= self._first_id:
-            self._gave_up(inputs, f"perch given up: {inputs.controller_message}")
+            self._fail_without_retry(inputs, f"perch given up: {inputs.controller_message}")
             return
-        if hovers and inputs.time > self._first_start + TAKEN:
-            outputs.commands.append((Command.HOVER, "the plan was not taken"))  # nor later
-            self._end(outputs, Result.REFUSED, f"the controller has not taken the plan: {inputs.controller_message}")
+        if hovers and inputs.time > self._first_start + ACCEPTANCE_TIMEOUT:
+            outputs.commands.append((Command.HOVER, "the plan was not accepted"))  # and must not be later
+            self._end(outputs, Result.REFUSED, f"the controller has not accepted the plan: {inputs.controller_message}")
             return
-        if not hovers:  # a controller that hovers has not begun, or was told to stay
-            self.better(inputs, outputs)
+        if not hovers:  # a controller that hovers has not begun, or was commanded to stay
+            self.update_plan(inputs, outputs)
         if inputs.time > end - self.settings.contact_early:
             self._adhesion.reset()
             self._enter(Phase.VERIFYING, inputs.time, "waiting for contact")
@@ -124,45 +124,45 @@ class PerchingMission(MissionMachine, Generic[R]):
             self._adhesion.reset()
             outputs.commands.append((Command.ATTACHED, "the surface carries the vehicle"))
             self._enter(Phase.PERCHED, inputs.time, "attached, motors off")
-        elif self._descends(inputs, outputs):
+        elif self._handle_descent(inputs, outputs):
             pass
         elif inputs.controller in (ControllerState.RECOVERING, ControllerState.HOVERING):
             if inputs.time < self._running.plan.end:
-                self._gave_up(inputs, f"perch given up: {inputs.controller_message}")
+                self._fail_without_retry(inputs, f"perch given up: {inputs.controller_message}")
             else:
-                self._missed(inputs, f"no adhesion: {inputs.controller_message}")
-        elif not self.waiting(inputs, outputs):
-            self.not_held(outputs)
-            self._missed(inputs, "no adhesion")
+                self._fail_attempt(inputs, f"no adhesion: {inputs.controller_message}")
+        elif not self.contact_awaited(inputs, outputs):
+            self.on_no_contact(outputs)
+            self._fail_attempt(inputs, "no adhesion")
 
     def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._adhesion.fallen_off(inputs.state):
-            self._off = True
-            self._motors_on(outputs)
-            self._missed(inputs, "came off the surface after the motors stopped")
+        if self._adhesion.detached(inputs.state):
+            self._detached = True
+            self._start_motors(outputs)
+            self._fail_attempt(inputs, "came off the surface after the motors stopped")
         elif self._elapsed(inputs) > self.settings.rest_time and inputs.controller is not ControllerState.ATTACHED:
             self._end(outputs, Result.TRACKING_LOST, f"the controller is not attached: {inputs.controller_message}")
         elif self._elapsed(inputs) > self.settings.rest_time:
-            result, words = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
-            self._end(outputs, result, f"{words}perched", contact_time=self._contact_time)
-        elif inputs.controller in _FLYING_ON and inputs.time - self._told_at > TELL_AGAIN:
-            self._told_at = inputs.time
-            outputs.commands.append((Command.ATTACHED, "told again"))  # the first message was lost
+            result, prefix = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
+            self._end(outputs, result, f"{prefix}perched", contact_time=self._contact_time)
+        elif inputs.controller in _IN_FLIGHT and inputs.time - self._attached_sent_at > ATTACHED_RETRY:
+            self._attached_sent_at = inputs.time
+            outputs.commands.append((Command.ATTACHED, "repeated"))  # the first command was lost
 
-    def _motors_on(self, outputs: Outputs) -> None:
+    def _start_motors(self, outputs: Outputs) -> None:
         """Start the motors and hover: the vehicle has come off."""
         outputs.commands += [(Command.ARM, "came off the surface"), (Command.HOVER, "came off the surface")]
 
     def _recovering(self, inputs: Inputs, outputs: Outputs) -> None:
         super()._recovering(inputs, outputs)
-        if self._off and self.phase is Phase.RECOVERING and inputs.controller is ControllerState.ATTACHED:
-            self._motors_on(outputs)  # the commands before were lost, or refused for a moment
+        if self._detached and self.phase is Phase.RECOVERING and inputs.controller is ControllerState.ATTACHED:
+            self._start_motors(outputs)  # the commands before were lost, or refused for a moment
 
     def _enter(self, phase: Phase, time: float, message: str) -> None:
         super()._enter(phase, time, message)
-        self._off = self._off and phase is Phase.RECOVERING
+        self._detached = self._detached and phase is Phase.RECOVERING
         if phase is Phase.PERCHED:  # however the goal ends, this is what carries the vehicle
-            self._told_at = time
+            self._attached_sent_at = time
             self._moves.wire = self._running.target if self._running.target.lines else None
 
     # -- plans in flight ---------------------------------------------------------------------------------------------
@@ -171,6 +171,6 @@ class PerchingMission(MissionMachine, Generic[R]):
         self._running, self._flown_id = running, self._new_id()
         outputs.perch, outputs.trajectory_id = running.plan, self._flown_id
 
-    def _fly_better(self, better: R, outputs: Outputs) -> None:
-        self._fly(better, outputs)
-        self.message = f"re-planned, {better.plan.duration:.2f} s"
+    def _fly_new_plan(self, running: R, outputs: Outputs) -> None:
+        self._fly(running, outputs)
+        self.message = f"re-planned, {running.plan.duration:.2f} s"

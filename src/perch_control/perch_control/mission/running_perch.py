@@ -22,19 +22,19 @@ class RunningPerch:
     Attributes:
         plan: the plan being flown.
         target: the target that it was made for.
-        asked: target of the newest query.
-        asked_at: time of the newest query [s].
+        requested_target: target of the newest query.
+        requested_at: time of the newest query [s].
         ways_out: ways out of the plan.
     """
 
     plan: Plan
     target: Target
-    asked: Target
+    requested_target: Target
     ways_out: WaysOut
-    asked_at: float = -math.inf
+    requested_at: float = -math.inf
 
     @classmethod
-    def begun(cls, plan: Plan, target: Target, settings: MissionSettings) -> RunningPerch:
+    def from_plan(cls, plan: Plan, target: Target, settings: MissionSettings) -> RunningPerch:
         """Return a planner's answer as a plan in flight; there is no way out within `contact_early` before the contact."""
         return cls(plan, target, target, WaysOut(plan.start_time - _SPACING, plan.end - settings.contact_early, _SPACING))
 
@@ -45,13 +45,13 @@ class RunningPerch:
             return None
         return PlanQuery(start, zero, zero, 0.0, self.target, goal, settings.planner_latency, current=self.plan.trajectory, recovery=True)
 
-    def better(self, answer: Plan | Refusal | None, time: float, settings: MissionSettings) -> RunningPerch | None:
+    def accepted(self, answer: Plan | Refusal | None, time: float, settings: MissionSettings) -> RunningPerch | None:
         """Return the plan to fly, from the answer to the newest query: a new one, or this one if that is a detour; None: none."""
         if not isinstance(answer, Plan) or answer.start_time <= time:
             return None
         if abs(answer.end - self.plan.end) > settings.replan_shift:
             return self  # a detour: the running plan is better
-        return replace(RunningPerch.begun(answer, self.asked, settings), asked_at=self.asked_at)
+        return replace(RunningPerch.from_plan(answer, self.requested_target, settings), requested_at=self.requested_at)
 
     def query(self, time: float, target: Target | None, goal: Goal, settings: MissionSettings,
               start: float, latency: float) -> tuple[RunningPerch, PlanQuery] | None:
@@ -65,10 +65,10 @@ class RunningPerch:
             start: earliest start of a new plan [s].
             latency: time from the request to the use of a plan [s].
         """
-        if target is None or target.time <= self.asked.time or self.plan.end - start <= settings.replan_until:
+        if target is None or target.time <= self.requested_target.time or self.plan.end - start <= settings.replan_until:
             return None
-        if start <= self.plan.start_time or time - self.asked_at < settings.replan_period:
+        if start <= self.plan.start_time or time - self.requested_at < settings.replan_period:
             return None
         zero = np.zeros(3)
         query = PlanQuery(start, zero, zero, 0.0, target, goal, latency, current=self.plan.trajectory, duration=self.plan.end - start)
-        return replace(self, asked=target, asked_at=time), query
+        return replace(self, requested_target=target, requested_at=time), query

@@ -21,10 +21,10 @@ from perch_core.values import AtEnd
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import TICK, Goal, Plan, PlanQuery, Refusal, State, Target
 from perch_control.mission.ways_out import DECISION, WaysOut
-from perch_control.smooth_position import BEFORE
+from perch_control.smooth_position import START_BEFORE_CONTACT
 
-AHEAD_LATENCY = 0.2  # what is asked while a plan is flown is used so long after its request [s]
-_AS_SURE = 1.2  # a wire out of sight gets a little less certain with every metre flown; it moves with the frame all the same
+AHEAD_LATENCY = 0.2  # answers to requests during a plan are used so long after the request [s]
+_SIGMA_GROWTH = 1.2  # tolerated growth of a wire's uncertainty: out of sight, it grows with every metre flown
 
 
 class RunningPlan:
@@ -41,11 +41,11 @@ class RunningPlan:
         self.plan, self.target, self.states = plan, target, states
         self.ways_out = WaysOut(plan.start_time, plan.end - settings.way_out_until, settings.way_out_spacing)
         self._settings, self._replanned_at = settings, replanned_at
-        self._asked: PlanQuery | None = None
-        self._leaving = False  # the way out from the wire has been asked for
+        self._pending_query: PlanQuery | None = None
+        self._departure_requested = False  # the way out from the wire has been requested
 
     @classmethod
-    def begun(cls, plan: Plan, target: Target, settings: MissionSettings, replanned_at: float = -math.inf) -> RunningPlan:
+    def from_plan(cls, plan: Plan, target: Target, settings: MissionSettings, replanned_at: float = -math.inf) -> RunningPlan:
         """Return a planner's answer as a plan in flight.
 
         Raises:
@@ -68,18 +68,19 @@ class RunningPlan:
             target: target by the present map, if certain enough to plan on.
             goal: goal of the mission.
         """
-        if self._asked is not None:
+        if self._pending_query is not None:
             return None
         s, soonest = self._settings, time + AHEAD_LATENCY + DECISION
-        if goal.replan and target is not None and self._better(target, time, soonest):
+        if goal.replan and target is not None and self._replan_needed(target, time, soonest):
             self._replanned_at = time
-            return self._ask(soonest, self.state(soonest), target, goal, perch_pose=self._perch_pose(target))
+            return self._request(soonest, self.state(soonest), target, goal, perch_pose=self._perch_pose(target))
         if (start := self.ways_out.next(soonest)) is not None:
-            return self._ask(start, self.state(start), self.target, goal, recovery=True)
-        if not self._leaving and self.plan.end - TICK < soonest < self.plan.end + s.contact_time:
-            self._leaving = True
+            return self._request(start, self.state(start), self.target, goal, recovery=True)
+        if not self._departure_requested and self.plan.end - TICK < soonest < self.plan.end + s.contact_time:
+            self._departure_requested = True
             start = max(soonest, self.plan.end)
-            return self._ask(start, self._continued(time, present, start), self.target if target is None else target, goal, recovery=True)
+            return self._request(start, self._continued(time, present, start), self.target if target is None else target, goal,
+                                 recovery=True)
         return None
 
     def answered(self, plan: Plan | Refusal, time: float) -> tuple[Plan | None, RunningPlan | None]:
@@ -88,7 +89,7 @@ class RunningPlan:
         Returns:
             A way out to keep ready, or None; and the plan to fly instead of this one, or None.
         """
-        query, self._asked = self._asked, None
+        query, self._pending_query = self._pending_query, None
         if query is None:
             return None, None
         if query.recovery:
@@ -97,12 +98,12 @@ class RunningPlan:
             return None, None
         if query.recovery:
             return plan, None
-        late = plan.end - self.plan.end
-        if abs(late) > self._settings.replan_shift:
+        shift = plan.end - self.plan.end
+        if abs(shift) > self._settings.replan_shift:
             return None, None  # a detour: the wire is better met as planned, or missed and left
-        return None, RunningPlan.begun(plan, query.target, self._settings, self._replanned_at)
+        return None, RunningPlan.from_plan(plan, query.target, self._settings, self._replanned_at)
 
-    def moved(self, time: float, target: Target | None, goal: Goal) -> RunningPlan | None:
+    def shifted(self, time: float, target: Target | None, goal: Goal) -> RunningPlan | None:
         """Return the same plan, shifted with the wire; None: it is not shifted.
 
         At the wire, only the position relative to it matters. The odometry has drifted since the map was made, but wire and
@@ -115,26 +116,26 @@ class RunningPlan:
             goal: goal of the mission.
         """
         s = self._settings
-        if not goal.replan or target is None or not self._seen_better(target):
+        if not goal.replan or target is None or not self._better_observed(target):
             return None
-        if not self.plan.start_time + DECISION < time < self.plan.end - BEFORE:
+        if not self.plan.start_time + DECISION < time < self.plan.end - START_BEFORE_CONTACT:
             return None
         offset = target.p_WS - self.target.p_WS
         if not s.shift_distance < float(np.linalg.norm(offset)) < s.shift_max:
             return None
-        rest = self.states.rest_of(time - self.plan.start_time, offset)
+        rest = self.states.remainder(time - self.plan.start_time, offset)
         left = self.plan.end - rest.start_time
         following = RunningPlan(Plan(rest, left, AtEnd.RECOVER, float(left)), target, s, rest, self._replanned_at)
-        following.ways_out, following._asked = self.ways_out, self._asked  # ways out stay: centimetres do not matter there
-        following._leaving = self._leaving
+        following.ways_out, following._pending_query = self.ways_out, self._pending_query  # kept: centimetres do not matter there
+        following._departure_requested = self._departure_requested
         return following
 
-    def _seen_better(self, target: Target) -> bool:
-        return target.time > self.target.time and target.position_sigma <= _AS_SURE * self.target.position_sigma
+    def _better_observed(self, target: Target) -> bool:
+        return target.time > self.target.time and target.position_sigma <= _SIGMA_GROWTH * self.target.position_sigma
 
-    def _better(self, target: Target, time: float, start: float) -> bool:
+    def _replan_needed(self, target: Target, time: float, start: float) -> bool:
         s = self._settings
-        return (self._seen_better(target) and self.plan.end - start > s.powerline_replan_until
+        return (self._better_observed(target) and self.plan.end - start > s.powerline_replan_until
                 and start > self.plan.start_time + DECISION and time - self._replanned_at >= s.powerline_replan_period
                 and float(np.linalg.norm(target.p_WS - self.target.p_WS)) > s.shift_max)
 
@@ -149,7 +150,8 @@ class RunningPlan:
         turned = so3.quat_multiply(present.q_WB, so3.quat_conjugate(now.q))
         return dataclasses.replace(then, p=then.p + present.p_WB - now.p, v=then.v + present.v_WB - now.v, q=so3.quat_multiply(turned, then.q))
 
-    def _ask(self, start: float, x: StateSample, target: Target, goal: Goal, recovery: bool = False,
-             perch_pose: tuple[np.ndarray, np.ndarray] | None = None) -> PlanQuery:
-        self._asked = PlanQuery(start, x.p, x.v, 0.0, target, goal, latency=AHEAD_LATENCY, state=x, recovery=recovery, perch_pose=perch_pose)
-        return self._asked
+    def _request(self, start: float, x: StateSample, target: Target, goal: Goal, recovery: bool = False,
+                 perch_pose: tuple[np.ndarray, np.ndarray] | None = None) -> PlanQuery:
+        self._pending_query = PlanQuery(start, x.p, x.v, 0.0, target, goal, latency=AHEAD_LATENCY, state=x, recovery=recovery,
+                                        perch_pose=perch_pose)
+        return self._pending_query

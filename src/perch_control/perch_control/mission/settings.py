@@ -21,11 +21,11 @@ class MissionSettings:
     transit_speed: float = quantity(0.8, unit="m/s", above=0.0, high=5.0, doc="mean speed of take-off and search moves")
     settle_time: ClassVar[float] = 0.6  # rest after a move before it counts as reached [s]
     settle_speed: ClassVar[float] = 0.15  # speed below which the vehicle rests [m/s]
-    search_timeout: float = quantity(10.0, unit="s", above=0.0, high=300.0, doc="the target is looked for so long, then the goal ends with NOT_FOUND")
-    search_dwell: ClassVar[float] = 2.0  # look this long at each place of the pattern [s]
+    search_timeout: float = quantity(10.0, unit="s", above=0.0, high=300.0, doc="longest search; the goal then ends with NOT_FOUND")
+    search_dwell: ClassVar[float] = 2.0  # time of observation at each place of the pattern [s]
     target_settle: ClassVar[float] = 0.5  # observe the target this long before planning [s]
     target_position_sigma: float = quantity(0.06, unit="m", above=0.0, high=1.0,
-                                          doc="plan only on a target whose place relative to the vehicle is as certain as this")
+                                          doc="largest 1-sigma of the target's position relative to the vehicle, to plan on it")
     planner_latency: float = quantity(0.04, unit="s", low=0.0, high=5.0, doc="a plan is used this long after its request")
     powerline_latency: float = quantity(1.0, unit="s", low=0.0, high=10.0, doc="the same for a powerline plan")
     way_out_spacing: ClassVar[float] = 0.3  # between the starts of recoveries that are kept ready [s]
@@ -35,18 +35,18 @@ class MissionSettings:
     shift_distance: ClassVar[float] = 0.004  # ... where the wire has moved by more than this ... [m]
     shift_max: ClassVar[float] = 0.15  # ... and less than this; beyond it the rest is planned again [m]
     replan_shift: ClassVar[float] = 0.3  # a new plan whose contact is earlier or later by more is not flown [s]
-    mapping_approach: float = quantity(2.8, unit="m", low=0.0, high=10.0, doc="how far the vehicle goes nearer to see lines better")
-    mapping_standoff: float = quantity(2.2, unit="m", above=0.0, high=50.0, doc="but not nearer to the target than this")
+    mapping_approach: float = quantity(2.8, unit="m", low=0.0, high=10.0, doc="approach towards the lines, to map them better")
+    mapping_standoff: float = quantity(2.2, unit="m", above=0.0, high=50.0, doc="least distance to the target in that approach")
     plan_lead: float = quantity(0.1, unit="s", low=0.01, high=5.0, doc="a plan starts this long after its request, at least the latency")
     replan_period: ClassVar[float] = 0.1  # [s]
     replan_until: ClassVar[float] = 0.4  # no new plan closer than this to the contact [s]
     contact_time: float = quantity(0.25, unit="s", low=0.0, high=2.0, doc="how long adhesion is awaited after the planned contact")
-    contact_early: ClassVar[float] = CONTACT_EARLY  # how long before the planned contact adhesion is looked for [s]
+    contact_early: ClassVar[float] = CONTACT_EARLY  # how long before the planned contact adhesion is monitored [s]
     waypoints: tuple[float, ...] = quantity((), unit="m, deg", doc="of an inspection, in map: x, y, z, yaw of each, one after the other")
     inspection_speed: float = quantity(0.5, unit="m/s", above=0.0, high=5.0, doc="mean speed between waypoints")
     rest_time: ClassVar[float] = 0.6  # rest with motors off that confirms the perch [s]
     arming_timeout: ClassVar[float] = 10.0  # [s]
-    ask_again: ClassVar[float] = 1.0       # between two requests to arm [s]
+    arm_retry_period: ClassVar[float] = 1.0  # between two requests to arm [s]
     phase_timeout: ClassVar[float] = 20.0  # longest take-off or recovery [s]
 
     def __post_init__(self) -> None:

@@ -11,9 +11,9 @@ from perch_control.mission.ways_out import WaysOut
 class SurfaceMission(PerchingMission[RunningPerch]):
     """Find the pad, plan, perch; re-plan to the pad as seen from closer, if requested. Ways out of the plan are kept ready."""
 
-    unseen = "no tags seen"
-    _asked_way_out: tuple[PlanQuery, WaysOut] | None = None
-    _asked_again = False  # a new plan has been asked for, and not answered
+    no_target_message = "no tags detected"
+    _pending_way_out: tuple[PlanQuery, WaysOut] | None = None
+    _replan_pending = False  # a new plan has been requested, and not answered
 
     @property
     def latency(self) -> float:
@@ -22,13 +22,13 @@ class SurfaceMission(PerchingMission[RunningPerch]):
 
     def running(self, plan: Plan, target: Target) -> RunningPerch:
         """Return a plan in flight; queries of an earlier attempt are discarded."""
-        self._asked_way_out, self._asked_again = None, False
-        return RunningPerch.begun(plan, target, self.settings)
+        self._pending_way_out, self._replan_pending = None, False
+        return RunningPerch.from_plan(plan, target, self.settings)
 
-    def better(self, inputs: Inputs, outputs: Outputs) -> None:
+    def update_plan(self, inputs: Inputs, outputs: Outputs) -> None:
         """Re-plan to the target as seen from closer, and keep ways out ready."""
-        if inputs.way_out is not None and self._asked_way_out is not None:
-            (query, ways), self._asked_way_out = self._asked_way_out, None
+        if inputs.way_out is not None and self._pending_way_out is not None:
+            (query, ways), self._pending_way_out = self._pending_way_out, None
             if isinstance(inputs.way_out, Refusal):
                 ways.answered(query.start_time, inputs.way_out.message)
             else:
@@ -36,28 +36,30 @@ class SurfaceMission(PerchingMission[RunningPerch]):
                 if ways is self._running.ways_out:
                     outputs.way_out, outputs.trajectory_id = inputs.way_out, self._flown_id
         if self._goal.replan:
-            self._plan_again(inputs, outputs)
-        if self._asked_way_out is None and (asked := self._running.way_out(inputs.time, self._goal, self.settings)) is not None:
-            self._asked_way_out, outputs.way_out_query = (asked, self._running.ways_out), asked
+            self._replan(inputs, outputs)
+        if self._pending_way_out is None:
+            next_query = self._running.way_out(inputs.time, self._goal, self.settings)
+            if next_query is not None:
+                self._pending_way_out, outputs.way_out_query = (next_query, self._running.ways_out), next_query
 
-    def _plan_again(self, inputs: Inputs, outputs: Outputs) -> None:
+    def _replan(self, inputs: Inputs, outputs: Outputs) -> None:
         """Re-plan from a future state of the running plan to the target as seen at present (M's future work)."""
         if inputs.plan is not None:
-            self._asked_again = False
-        better = self._running.better(inputs.plan, inputs.time, self.settings)
-        if better is not None:
-            if better is not self._running:
-                self._fly_better(better, outputs)
+            self._replan_pending = False
+        accepted = self._running.accepted(inputs.plan, inputs.time, self.settings)
+        if accepted is not None:
+            if accepted is not self._running:
+                self._fly_new_plan(accepted, outputs)
                 outputs.way_out = None  # of the plan before
             return
-        if self._asked_again:
+        if self._replan_pending:
             return
         start = inputs.time + self.settings.lead(self.latency)
-        asked = self._running.query(inputs.time, self._usable_now(inputs)[0], self._goal, self.settings, start, self.latency)
-        if asked is not None:
-            (self._running, outputs.query), self._asked_again = asked, True
+        next_query = self._running.query(inputs.time, self._usable_now(inputs)[0], self._goal, self.settings, start, self.latency)
+        if next_query is not None:
+            (self._running, outputs.query), self._replan_pending = next_query, True
 
-    def not_held(self, outputs: Outputs) -> None:
+    def on_no_contact(self, outputs: Outputs) -> None:
         """Command a hover: the trajectory ends at the contact."""
         outputs.commands.append((Command.HOVER, "no adhesion"))
 

@@ -11,11 +11,11 @@ from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Goal, Target
 
 ATTITUDE_SIGMA_MAX = math.radians(5.0)      # of a target to plan on [rad]
-INCLINATION_TOLERANCE = math.radians(15.0)  # difference from what the goal says, beyond which it is another surface [rad]
+INCLINATION_TOLERANCE = math.radians(15.0)  # difference from the goal's, beyond which it is another surface [rad]
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-def unusable(target: Target, goal: Goal, settings: MissionSettings) -> str:
+def unusable_reason(target: Target, goal: Goal, settings: MissionSettings) -> str:
     """Return why a target is too uncertain to plan on, or not the one of the goal; empty: it is usable.
 
     Args:

@@ -10,7 +10,7 @@ import numpy as np
 from perch_control.mission.moves import TURN_RATE, Place
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 
-_SHORTEST = 1.0  # duration of the shortest leg [s]
+_LEG_DURATION_MIN = 1.0  # duration of the shortest leg [s]
 
 
 def waypoint_lines(places: Sequence[Place], speed: float, start_time: float = 0.0) -> FlatTrajectory:
@@ -27,7 +27,7 @@ def waypoint_lines(places: Sequence[Place], speed: float, start_time: float = 0.
     yaw = places[0][1]
     for (p0, _), (p1, yaw1) in zip(places, places[1:], strict=False):
         turn = math.remainder(yaw1 - yaw, 2 * math.pi)
-        duration = max(_SHORTEST, float(np.linalg.norm(np.subtract(p1, p0))) / speed, abs(turn) / TURN_RATE)
+        duration = max(_LEG_DURATION_MIN, float(np.linalg.norm(np.subtract(p1, p0))) / speed, abs(turn) / TURN_RATE)
         leg = rest_to_rest(p0, p1, yaw, yaw + turn, duration)
         durations.append(duration)
         coefficients.append(leg.coefficients[0])

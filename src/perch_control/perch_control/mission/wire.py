@@ -7,7 +7,7 @@ import numpy as np
 from perch_core.values import PowerlineMap
 from perch_control.mission.line_target import mapped_target
 from perch_control.mission.machine import MissionMachine
-from perch_control.mission.moves import Look
+from perch_control.mission.moves import SearchPlace
 from perch_control.mission.perching import PerchingMission
 from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.values import Inputs, Outputs, Plan, Target
@@ -19,13 +19,13 @@ MAPPING_LEGS = 3     # moves of the pattern before a plan: up, nearer, down; per
 class LineMission(MissionMachine):
     """Mission at a mapped powerline: the lines are observed from several places."""
 
-    unseen = "no line mapped near the goal's point, or a vertical one"
+    no_target_message = "no line mapped near the goal's point, or a vertical one"
 
     def target(self, pad: Target | None, lines: PowerlineMap | None, p_WB: np.ndarray) -> Target | None:
         """Return the target on the mapped line that the goal refers to."""
         return None if lines is None else mapped_target(lines, self._goal, p_WB)
 
-    def pattern(self) -> list[Look]:
+    def pattern(self) -> list[SearchPlace]:
         """Places to observe the lines from: up, closer (the error of a distance grows with its square), down, back, and aside."""
         reach, near = MAPPING_REACH, self.settings.mapping_approach
         return [(np.array(v), 0.0) for v in ((0, 0, reach), (near, 0, reach), (near, 0, 0), (0, 0, 0), (0, reach / 2, 0))]
@@ -53,25 +53,25 @@ class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
 
     def running(self, plan: Plan, target: Target) -> RunningPlan:
         """Return a plan and its target as a plan in flight."""
-        return RunningPlan.begun(plan, target, self.settings)
+        return RunningPlan.from_plan(plan, target, self.settings)
 
-    def better(self, inputs: Inputs, outputs: Outputs) -> None:
+    def update_plan(self, inputs: Inputs, outputs: Outputs) -> None:
         """Update the plan as the map improves, and keep a way out ready."""
         if inputs.plan is not None:
-            outputs.way_out, better = self._running.answered(inputs.plan, inputs.time)
+            outputs.way_out, new = self._running.answered(inputs.plan, inputs.time)
             outputs.trajectory_id = self._flown_id
-            if better is not None:
-                self._fly_better(better, outputs)
+            if new is not None:
+                self._fly_new_plan(new, outputs)
         target, _ = self._usable_now(inputs)
-        moved = self._running.moved(inputs.time, target, self._goal)
-        if moved is not None and outputs.perch is None and outputs.way_out is None:
-            self._running = moved
-            outputs.perch, outputs.trajectory_id = moved.plan, self._flown_id
+        shifted = self._running.shifted(inputs.time, target, self._goal)
+        if shifted is not None and outputs.perch is None and outputs.way_out is None:
+            self._running = shifted
+            outputs.perch, outputs.trajectory_id = shifted.plan, self._flown_id
         outputs.query = self._running.query(inputs.time, inputs.state, target, self._goal)
 
-    def waiting(self, inputs: Inputs, outputs: Outputs) -> bool:
+    def contact_awaited(self, inputs: Inputs, outputs: Outputs) -> bool:
         """Whether the contact is still awaited. Ways out are requested until the plan continues into its own recovery."""
         if inputs.time <= self._running.plan.end + self.settings.contact_time:
-            self.better(inputs, outputs)
+            self.update_plan(inputs, outputs)
             return True
-        return super().waiting(inputs, outputs)
+        return super().contact_awaited(inputs, outputs)

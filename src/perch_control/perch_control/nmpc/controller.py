@@ -9,7 +9,7 @@ import numpy as np
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.law import NO_COMPENSATION, ControlOutput, Law
 from perch_control.nmpc.condensing import solve_condensed
-from perch_control.nmpc.iteration import answer, apply, begin, finish, input_bounds
+from perch_control.nmpc.iteration import apply, begin, finish, first_command, input_bounds
 from perch_control.nmpc.linearisation import Linearisation
 from perch_control.nmpc.model import DISTURBANCE, INPUTS, LINE, LINES, REFERENCE, WEIGHTS, StageLayout
 from perch_control.nmpc.qp import QpFailure
@@ -32,7 +32,7 @@ _RATE_PRICE, _THRUST_PRICE = 1e5, 1e6  # of half the squared excess over a state
 _NODES = 20              # shooting intervals N of [P:VI]: 50 ms each over 1 s; what is solved in 2 ms
 _TERMINAL = 4.0          # factor of the state weights at the last node, for what comes after the horizon
 _THRUST_RATE_WEIGHT = 0.002  # of the rotor thrusts' rates where these are the inputs: keeps the QP strictly convex [s^2/N^2]
-_LINE_MARGIN = 0.3       # scaled clearance below which the collision term acts, so that it is felt before the line is met
+_LINE_MARGIN = 0.3       # scaled clearance below which the collision term acts, to act before the line is reached
 LINE_RAMP = 3.0          # line terms grow to their weights over so long: at once they would be a jump of the command [s]
 _ACTIVE_SETS = 12        # tried in one period before the dense QP is solved
 _FAR_LINE = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 1.0, 0.01)
@@ -67,7 +67,7 @@ class NmpcController(Law):
         self._line_time = 0.0
         self._lines: tuple[tuple[float, ...], ...] = ()
         self.failures = 0
-        self._weights()
+        self._update_weights()
         self._warm_up()
 
     @classmethod
@@ -87,11 +87,11 @@ class NmpcController(Law):
         self.control(rest, Resting(), RotorEstimate((hover,) * 4, (hover,) * 4))
         self._warm, self.failures = False, 0
 
-    def _weights(self) -> None:
+    def _update_weights(self) -> None:
         s, n = self.settings, self._layout.states
         self._lead = self.fallback.gains.lead
         self._rate_max, self._thrust_rate_max = _RATE_RESERVE * self._nominal.body_rate_max, _thrust_rate(self.vehicle)
-        self.fallback.pace(self.period)
+        self.fallback.set_period(self.period)
         z = self._stages.arguments
         k = n + INPUTS + REFERENCE + DISTURBANCE
         z[:, k:k + WEIGHTS] = (*s.position, *s.velocity, *s.attitude, *s.rate, s.thrust)
@@ -110,7 +110,7 @@ class NmpcController(Law):
         if settings.lines.any != old.lines.any:
             raise ConfigError("nmpc", "lines", "line terms cannot be switched on or off after the start")
         self.settings, self.fallback = settings, fallback
-        self._weights()
+        self._update_weights()
 
     def retuned(self, params: ControllerParameters) -> NmpcController:
         """As `retune`, from the controller's parameters; nothing is recompiled."""
@@ -121,20 +121,20 @@ class NmpcController(Law):
         """Take over in flight: the first iterate is the reference."""
         self._warm = False
 
-    def believe(self, vehicle: Vehicle) -> None:
+    def set_vehicle(self, vehicle: Vehicle) -> None:
         """Use a vehicle model that differs from the initial one in its thrust; the compiled code takes rotor thrusts only."""
         self.vehicle, self._constants = vehicle, packed_vehicle(vehicle)
         self._rows = self._new_rows()
-        self._weights()
-        self.fallback.believe(vehicle)
+        self._update_weights()
+        self.fallback.set_vehicle(vehicle)
 
-    def pace(self, period: float) -> None:
+    def set_period(self, period: float) -> None:
         """Use another period of the odometry [s]: the compiled node spacing is kept, as a whole number of new periods."""
         if period == self.period:
             return
         self.period, self._spacing = period, max(1, round(self._dt / period))
         self._rows = self._new_rows()
-        self._weights()
+        self._update_weights()
 
     def _new_rows(self) -> ReferenceRows:
         period = self.period if self.period == NOMINAL_PERIOD else self._dt / self._spacing
@@ -198,7 +198,7 @@ class NmpcController(Law):
             self._work.clear()
         apply(*solve_condensed(stages, X, U, self._start - X[0], weight, self._target, _TERMINAL, self._low, self._high, self._x_low,
                                self._x_high), X, U)
-        return answer(U, n, rotors.speed, lead, self._constants)
+        return first_command(U, n, rotors.speed, lead, self._constants)
 
     def _fill_lines(self, z: np.ndarray) -> None:
         weights = self.settings.lines

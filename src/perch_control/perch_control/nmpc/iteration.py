@@ -39,8 +39,8 @@ def begin(state, speed, command, compensation, lead, vehicle, R, ramps, X, U, st
     if n == 13:
         half = 1.0 - exp(-0.5 * lead / max(tau, 1e-9))
         f = thrusts(approached(speed, command, half), coefficient)
-        felt = drag_compensation(state[6:10], state[3:6], vehicle[4], compensation)
-        state = predicted(state, f, felt, lead, vehicle[0][0], vehicle[0][1:4], vehicle[2])
+        with_drag = drag_compensation(state[6:10], state[3:6], vehicle[4], compensation)
+        state = predicted(state, f, with_drag, lead, vehicle[0][0], vehicle[0][1:4], vehicle[2])
     for i in range(3):
         start[i], start[7 + i], start[10 + i] = state[i], state[3 + i], state[10 + i]
     for i in range(4):
@@ -104,7 +104,7 @@ def apply(dx, du, X, U):
 
 
 @compiled
-def answer(U, n, speed, lead, vehicle):
+def first_command(U, n, speed, lead, vehicle):
     """Rotor commands [rad/s], wanted wrench [N, N m] and the thrusts that will be reached [N] for the first input, 4 floats each."""
     coefficient, speed_min, speed_max, _ = vehicle[1]
     f = (U[0, 0], U[0, 1], U[0, 2], U[0, 3])
@@ -119,10 +119,11 @@ def answer(U, n, speed, lead, vehicle):
 
 @compiled
 def finish(stages, X, U, start, weight, target, terminal, low, high, x_low, x_high, price, rounds, work, dx, du, speed, lead, vehicle):
-    """Solve the QP, update the iterate, and return the answer; arguments as in `solve_stages` and `answer`.
+    """Solve the QP, update the iterate, and return the first command; arguments as in `solve_stages` and `first_command`.
 
     Returns:
-        Number of active sets tried (0: the correct one was not found, and the iterate is unchanged), and the result of `answer`.
+        Number of active sets tried (0: the correct one was not found, and the iterate is unchanged), and the result of
+        `first_command`.
     """
     n = X.shape[1]
     for i in range(n):
@@ -130,4 +131,4 @@ def finish(stages, X, U, start, weight, target, terminal, low, high, x_low, x_hi
     tried = solve_stages(stages, X, U, dx[0], weight, target, terminal, low, high, x_low, x_high, price, rounds, work, dx, du)
     if tried > 0:
         apply(dx, du, X, U)
-    return tried, answer(U, n, speed, lead, vehicle)
+    return tried, first_command(U, n, speed, lead, vehicle)

@@ -16,8 +16,8 @@ from perch_core.jit import compiled
 from perch_core.vector3 import axpy, cross, dot, norm, quaternion_of, times
 from perch_core.vehicle import GRAVITY
 
-_NEVER = -(1 << 62)
-_OFF = 0.25  # of a period, beyond which the phase of the rows is another one
+_EMPTY = -(1 << 62)
+_PHASE_TOLERANCE = 0.25  # of a period, beyond which the phase of the rows is another one
 
 
 @compiled
@@ -68,7 +68,7 @@ def reference_row(x, floor, vehicle):
 
 
 @compiled
-def missing(stamps, first, spacing, nodes):
+def missing_periods(stamps, first, spacing, nodes):
     """Periods of the nodes whose rows are not in the ring buffer."""
     out = np.empty(nodes, np.int64)
     n = 0
@@ -81,7 +81,7 @@ def missing(stamps, first, spacing, nodes):
 
 
 @compiled
-def keep(setpoints, periods, floor, vehicle, rows, stamps):
+def store_rows(setpoints, periods, floor, vehicle, rows, stamps):
     """Write the rows of packed setpoints (n, 33) to the ring buffer, at their periods (n,)."""
     for k in range(len(periods)):
         slot = periods[k] % len(stamps)
@@ -92,7 +92,7 @@ def keep(setpoints, periods, floor, vehicle, rows, stamps):
 
 
 @compiled
-def take(rows, stamps, first, spacing, out):
+def copy_rows(rows, stamps, first, spacing, out):
     """Copy the rows of all nodes from the ring buffer to `out`."""
     for k in range(len(out)):
         out[k] = rows[(first + k * spacing) % len(stamps)]
@@ -112,7 +112,7 @@ class ReferenceRows:
         self._vehicle, self._floor, self._period = vehicle, floor, period
         self._source: Any = None
         self._phase = 0.0  # of the rows, after whole periods [s]
-        self._rows, self._stamps = np.zeros((periods + 1, 17)), np.full(periods + 1, _NEVER)
+        self._rows, self._stamps = np.zeros((periods + 1, 17)), np.full(periods + 1, _EMPTY)
 
     def fill(self, source: Any, elapsed: float, spacing: int, out: np.ndarray) -> None:
         """Write the rows of all nodes.
@@ -124,12 +124,13 @@ class ReferenceRows:
             out: shape (nodes, 17).
         """
         first = round((elapsed - self._phase) / self._period)
-        if source is not self._source or abs(elapsed - self._phase - first * self._period) > _OFF * self._period:
+        if source is not self._source or abs(elapsed - self._phase - first * self._period) > _PHASE_TOLERANCE * self._period:
             self._source = source
-            self._stamps[:] = _NEVER
+            self._stamps[:] = _EMPTY
             first = round(elapsed / self._period)
             self._phase = elapsed - first * self._period
-        periods = missing(self._stamps, first, spacing, len(out))
+        periods = missing_periods(self._stamps, first, spacing, len(out))
         if len(periods):
-            keep(packed_many(source, periods * self._period + self._phase), periods, self._floor, self._vehicle, self._rows, self._stamps)
-        take(self._rows, self._stamps, first, spacing, out)
+            store_rows(packed_many(source, periods * self._period + self._phase), periods, self._floor, self._vehicle, self._rows,
+                       self._stamps)
+        copy_rows(self._rows, self._stamps, first, spacing, out)

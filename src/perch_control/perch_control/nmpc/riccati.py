@@ -43,7 +43,7 @@ class Workspace:
 
 
 @compiled
-def _price_of_excess(X, soft, x_low, x_high, price, P, p):
+def _add_bound_penalty(X, soft, x_low, x_high, price, P, p):
     """Add the penalty of the active state bounds to the cost to go of a node."""
     for i in range(FIRST_BOUNDED, len(X)):
         if soft[i] != 0:
@@ -52,7 +52,7 @@ def _price_of_excess(X, soft, x_low, x_high, price, P, p):
 
 
 @compiled
-def _less(x, c, a, k, K):
+def _subtract_row(x, c, a, k, K):
     """Subtract x times row c from row a of the gains."""
     k[a] -= x * k[c]
     for j in range(K.shape[1]):
@@ -60,7 +60,7 @@ def _less(x, c, a, k, K):
 
 
 @compiled
-def _times(x, a, k, K):
+def _scale_row(x, a, k, K):
     """Multiply row a of the gains by x."""
     k[a] *= x
     for j in range(K.shape[1]):
@@ -99,15 +99,15 @@ def _gains(M, S, m, fixed, low, high, U, K, k, L):
             L[a, b] = s ** 0.5 if a == b else s / L[b, b]
         for c in range(a):
             if fixed[c] == 0:
-                _less(L[a, c], c, a, k, K)
-        _times(1.0 / L[a, a], a, k, K)
+                _subtract_row(L[a, c], c, a, k, K)
+        _scale_row(1.0 / L[a, a], a, k, K)
     for a in range(3, -1, -1):
         if fixed[a] != 0:
             continue
         for c in range(a + 1, 4):
             if fixed[c] == 0:
-                _less(L[c, a], c, a, k, K)
-        _times(1.0 / L[a, a], a, k, K)
+                _subtract_row(L[c, a], c, a, k, K)
+        _scale_row(1.0 / L[a, a], a, k, K)
 
 
 @compiled
@@ -121,7 +121,7 @@ def _backward(last, stages, X, U, R, target, terminal, low, high, x_low, x_high,
             for j in range(n):
                 P[N, i, j] = terminal * Q[N, i, j]
             p[N, i] = terminal * q[N, i]
-        _price_of_excess(X[N], soft[N], x_low, x_high, price, P[N], p[N])
+        _add_bound_penalty(X[N], soft[N], x_low, x_high, price, P[N], p[N])
     for s in range(last, -1, -1):
         A, B, Pn, Ss = At[s], Bt[s], P[s + 1], S[s]
         for i in range(n):  # v = P c + p, c the defect
@@ -181,7 +181,7 @@ def _backward(last, stages, X, U, R, target, terminal, low, high, x_low, x_high,
                 for j in range(n):
                     Pk[i, j] += y * Ks[a, j]
             p[s, i] = x
-        _price_of_excess(X[s], soft[s], x_low, x_high, price, Pk, p[s])
+        _add_bound_penalty(X[s], soft[s], x_low, x_high, price, Pk, p[s])
 
 
 @compiled

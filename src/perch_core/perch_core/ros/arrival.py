@@ -10,16 +10,16 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from perch_core.component import Action, Client, Component, Input, Service, Wake, ports
-from perch_core.ros.asking import connect_clients
+from perch_core.component import Action, Client, Component, Input, Service, Timer, ports
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.deadlines import Deadlines
 from perch_core.ros.intake import Intake
 from perch_core.ros.priority import priority
-from perch_core.ros.wiring import Wiring, foreign_writers
+from perch_core.ros.service_clients import connect_clients
+from perch_core.ros.wiring import Wiring, foreign_publishers
 from rclpy.clock import Clock, ClockType
 
-LOOK = 1.0  # between two looks for writers that are not heard [s]
+CHECK_PERIOD = 1.0  # of the check for foreign publishers, whose messages are ignored [s]
 
 
 class ArrivalNode(ComponentNode):
@@ -36,56 +36,56 @@ class ArrivalNode(ComponentNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._deadlines: Deadlines | None = None
         if deadline:
-            self._deadlines = late = Deadlines()
-            getattr(self.component, deadline).receivers.append(lambda value: late.answered(value.stamp, time.monotonic_ns()))
+            self._deadlines = deadlines = Deadlines()
+            getattr(self.component, deadline).receivers.append(lambda value: deadlines.record_answer(value.stamp, time.monotonic_ns()))
 
     def connect(self) -> None:
         """As in `ComponentNode`."""
-        for given in ports(type(self.component), Input):
-            self._intake.add(given)
-        for wake in ports(type(self.component), Wake):
-            self._wake(wake)
+        for port in ports(type(self.component), Input):
+            self._intake.add(port)
+        for timer in ports(type(self.component), Timer):
+            self._create_component_timer(timer)
         connect_clients(self, self.component, self._deliver_answer)
         self.serve()
         if self._intake.private:
-            self.create_timer(LOOK, self._look_for_strangers, clock=self._steady)
+            self.create_timer(CHECK_PERIOD, self._warn_foreign_publishers, clock=self._steady)
 
-    def _wake(self, port: Wake) -> None:
+    def _create_component_timer(self, port: Timer) -> None:
         handler, clock = partial(self.guarded, port.name, port.handler(self.component)), self.get_clock().handle
 
-        def wake() -> None:
+        def call() -> None:
             with clock:
                 now = clock.get_now().nanoseconds  # as `Clock.now` has it, without an object of the time: this runs at 500 Hz
             self._intake.enter(handler, now)
 
-        self.create_timer(port.period, wake, clock=self._steady)
+        self.create_timer(port.period, call, clock=self._steady)
 
-    def _look_for_strangers(self) -> None:
+    def _warn_foreign_publishers(self) -> None:
         """Warn once of each foreign publisher on a topic that a neighbour publishes: its messages are ignored."""
         for topic in sorted(self._intake.private):
             writer = self.wiring.writer(topic) or ""
-            for stranger in foreign_writers(self, topic, {writer}):
-                self.warn_once(f"{topic}: {stranger} publishes it, too, and is ignored: {writer} does in this process")
+            for foreign in foreign_publishers(self, topic, {writer}):
+                self.warn_once(f"{topic}: messages of {foreign} are ignored: the publisher in this process is {writer}")
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
-    def bring(self, port: Service[Any, Any] | Action, work: Callable[..., None], *arguments: Any) -> None:
+    def dispatch(self, port: Service[Any, Any] | Action, work: Callable[..., None], *arguments: Any) -> None:
         """Call `work` at once."""
         self.wiring.enter(self.guarded, port.name, work, *arguments)
 
     def _deliver_answer(self, port: Client[Any, Any], answer: Any) -> None:
         self.wiring.enter(self.guarded, port.name, port.handler(self.component), answer)
 
-    # -- people ------------------------------------------------------------------------------------------------------
+    # -- diagnostics and priority --------------------------------------------------------------------------------------
 
-    def host_figures(self) -> dict[str, Any]:
+    def host_diagnostics(self) -> dict[str, Any]:
         """Figures of the deadlines; empty without a deadline."""
         return self._deadlines.report() if self._deadlines is not None else {}
 
-    def hurry(self) -> None:
+    def request_real_time(self) -> None:
         """Request real-time scheduling if the node has a deadline."""
         if self._deadlines is None:
             return
-        self.wiring.paced = priority.nodes > 1
-        if problem := priority.ask():
+        self.wiring.bundled = priority.nodes > 1
+        if problem := priority.raise_priority():
             self.get_logger().warning(problem)

@@ -80,7 +80,7 @@ class Layout:
             for place in reversed(self._lengths):
                 values[place:place + 2] = (values[place + 1].decode(),)
         except (struct.error, ValueError) as error:
-            raise PerchError(f"{self._name}: {len(data)} bytes are no such message: {error}") from None
+            raise PerchError(f"{self._name}: {len(data)} bytes do not fit its layout: {error}") from None
         return values[1:]
 
     def pack(self, *content: float | str | bytes) -> bytes:

@@ -35,11 +35,11 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-LOUD = ("log", "diagnostics")  # outputs that are no topics of their own
-FEW = 300                      # calls whose durations are kept
-MOST_SAID = 100                # kinds of lines whose times are kept
-HEARTBEAT = 1.0                # a node whose component has nothing to report says all the same so often that it is there [s]
-LONGEST = 300                  # characters of a line that is no error of this program
+INTERNAL_OUTPUTS = ("log", "diagnostics")  # outputs that are no topics of their own
+DURATIONS_KEPT = 300    # calls whose durations are kept
+LOG_KINDS_MAX = 100     # kinds of lines whose times are kept
+HEARTBEAT_PERIOD = 1.0  # of the diagnostics of a node whose component emits none [s]
+LOG_LENGTH_MAX = 300    # characters of a log line below the level error
 _NUMBERS = re.compile(r"[-+.\de]*\d")  # what differs between lines of one kind
 
 
@@ -60,14 +60,14 @@ class ComponentNode(Node):
         self._unwatched: set[Subscription] = set()
         super().__init__(name, **kwargs)
         self.wiring = wiring
-        self._durations: defaultdict[str, deque[float]] = defaultdict(partial(deque, maxlen=FEW))
-        self._said: dict[str, float] = {}
-        self._warned: set[str] = set()
+        self._durations: defaultdict[str, deque[float]] = defaultdict(partial(deque, maxlen=DURATIONS_KEPT))
+        self._last_logged: dict[str, float] = {}
+        self._logged_once: set[str] = set()
         self._failures = 0
         self._goals: dict[str, ServedGoal] = {}
         try:
-            self._typed = Parameters(self, component.config_type, component.changeable, self._reconfigure)
-            self.component = component(self._typed.value)
+            self._typed_parameters = Parameters(self, component.config_type, component.changeable, self._reconfigure)
+            self.component = component(self._typed_parameters.value)
         except ConfigError:
             self.destroy_node()
             raise
@@ -78,8 +78,8 @@ class ComponentNode(Node):
         self.component.log.receivers.append(self._log)
         self._diagnostics = self.create_publisher(topics.message_type("/diagnostics"), "/diagnostics", topics.topic("/diagnostics").qos.publish)
         self.component.diagnostics.receivers.append(self._publish_diagnostics)
-        self._reported, self._report, self._process = 0.0, Diagnostics(0), f"{socket.gethostname()}:{os.getpid()}"
-        self.create_timer(HEARTBEAT, self._beat, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._last_report_time, self._last_report, self._process_name = 0.0, Diagnostics(0), f"{socket.gethostname()}:{os.getpid()}"
+        self.create_timer(HEARTBEAT_PERIOD, self._publish_heartbeat, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._publish_outputs()
         self.component.warm_up()
 
@@ -94,7 +94,7 @@ class ComponentNode(Node):
         self._unwatched.add(subscription)
         return subscription
 
-    def take_time_here(self) -> None:
+    def use_local_clock(self) -> None:
         """Receive simulation time as values if its publisher is in this process: messages to every node, 100 times a second,
         would delay steps. Called when all nodes of the process exist."""
         for subscription in tuple(self.subscriptions):
@@ -104,14 +104,14 @@ class ComponentNode(Node):
                 self.destroy_subscription(subscription)
 
     @staticmethod
-    def _pass_time(take: Callable[[ClockMessage], None], stamp: int) -> None:
-        take(topics.topic("/clock").to_message(stamp))
+    def _pass_time(callback: Callable[[ClockMessage], None], stamp: int) -> None:
+        callback(topics.topic("/clock").to_message(stamp))
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 
     def _publish_outputs(self) -> None:
         for port in ports(type(self.component), Output):
-            if port.name in LOUD:
+            if port.name in INTERNAL_OUTPUTS:
                 continue
             channel = port.channel(self.component)
             try:
@@ -122,16 +122,16 @@ class ComponentNode(Node):
             publisher = self.create_publisher(row.message, channel, row.qos.publish)
             publication = Publication(publisher, row.pack or row.to_message, row.latched, row.pack is not None, row.observed)
             emitter = getattr(self.component, port.name)
-            self.wiring.writes(publisher.topic_name, self.get_fully_qualified_name())
-            emitter.receivers.append(self._emitted(publisher.topic_name, publication))
-            emitter.asked = self._wanted(emitter, publisher.topic_name, publication)
+            self.wiring.register_writer(publisher.topic_name, self.get_fully_qualified_name())
+            emitter.receivers.append(self._emit_function(publisher.topic_name, publication))
+            emitter.receiver_check = self._receiver_check(emitter, publisher.topic_name, publication)
 
-    def _emitted(self, topic: str, publication: Publication) -> Callable[[Any], None]:
+    def _emit_function(self, topic: str, publication: Publication) -> Callable[[Any], None]:
         return partial(self.wiring.emit, topic, publication)
 
-    def _wanted(self, emitter: Emitter[Any], topic: str, publication: Publication) -> Callable[[], bool]:
+    def _receiver_check(self, emitter: Emitter[Any], topic: str, publication: Publication) -> Callable[[], bool]:
         """Return a check whether an output has a receiver: a neighbour, a subscriber, or one besides this host."""
-        return lambda: len(emitter.receivers) > 1 or self.wiring.read_here(topic) or publication.heard()
+        return lambda: len(emitter.receivers) > 1 or self.wiring.has_reader(topic) or publication.has_subscribers()
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
@@ -139,46 +139,46 @@ class ComponentNode(Node):
         """Wait until isolated jobs can run, then offer the component's services and actions."""
         self._jobs.wait_ready()
         for service in ports(type(self.component), Service):
-            self._serve(service)
+            self._serve_service(service)
         for action in ports(type(self.component), Action):
-            self._take_goals(action)
+            self._serve_action(action)
 
-    def _serve(self, port: Service[Any, Any]) -> None:
+    def _serve_service(self, port: Service[Any, Any]) -> None:
         channel = port.channel(self.component)
         row = topics.service(channel)
 
-        def take(request: Any, answer: Callable[[Any], None]) -> None:
+        def handle_request(request: Any, answer: Callable[[Any], None]) -> None:
             try:
                 value = row.request_value(request)
             except Exception as error:
-                self.refused(channel, error)
+                self.log_refusal(channel, error)
                 answer(self._bad_request(row, str(error)))
                 return
-            self.bring(port, self.begin_request, port, row, value, answer)
+            self.dispatch(port, self.begin_request, port, row, value, answer)
 
-        LateService(self, row.type, channel, take)
+        LateService(self, row.type, channel, handle_request)
 
     @staticmethod
-    def _bad_request(row: topics.ServiceRow, why: str) -> Any:
-        response = row.type.Response(success=False, message=why)
+    def _bad_request(row: topics.ServiceRow, reason: str) -> Any:
+        response = row.type.Response(success=False, message=reason)
         if hasattr(response, "error_code"):
             response.error_code = 1  # BAD_INPUT everywhere
         return response
 
-    def _take_goals(self, port: Action) -> None:
+    def _serve_action(self, port: Action) -> None:
         channel = port.channel(self.component)
         row = topics.action(channel)
 
         def accept(_: Any) -> GoalResponse:
-            present = self._goals.get(port.name)
-            if present is not None and not present.finished:
-                self.get_logger().warning(f"{channel}: goal rejected: another one is under way")
+            current = self._goals.get(port.name)
+            if current is not None and not current.finished:
+                self.get_logger().warning(f"{channel}: goal rejected: another goal is active")
                 return GoalResponse.REJECT
             return GoalResponse.ACCEPT
 
         def begin(handle: Any) -> None:
             goal = self._goals[port.name] = ServedGoal(server, handle, row)
-            self.bring(port, self.begin_goal, port, goal)
+            self.dispatch(port, self.begin_goal, port, goal)
 
         server = GoalServer(self, row.type, channel, begin, accept)
 
@@ -201,16 +201,16 @@ class ComponentNode(Node):
     def begin_goal(self, port: Action, goal: ServedGoal) -> None:
         """Pass a goal to the component; if the component rejects it or fails, end it at once."""
         try:
-            why = port.handler(self.component)(goal)
+            reason = port.handler(self.component)(goal)
         except Exception as error:
             if not goal.finished:
                 goal.reject(str(error))
             raise
-        if why:
-            self.get_logger().warning(f"{port.name}: goal rejected: {why}")
-            goal.reject(why)
+        if reason:
+            self.get_logger().warning(f"{port.name}: goal rejected: {reason}")
+            goal.reject(reason)
 
-    def bring(self, port: Service[Any, Any] | Action, work: Callable[..., None], *arguments: Any) -> None:
+    def dispatch(self, port: Service[Any, Any] | Action, work: Callable[..., None], *arguments: Any) -> None:
         """Schedule a request or a goal: call `work` with `arguments` in the order of the host."""
         raise NotImplementedError
 
@@ -223,25 +223,25 @@ class ComponentNode(Node):
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """As in `rclpy.node.Node`; refusals name the parameter and what is allowed."""
         try:
-            return super().set_parameters_atomically(self._typed.checked(parameter_list))
+            return super().set_parameters_atomically(self._typed_parameters.checked(parameter_list))
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
 
     def _reconfigure(self, config: Any) -> None:
         self.component.reconfigure(config)
 
-    # -- people ------------------------------------------------------------------------------------------------------
+    # -- log and diagnostics -----------------------------------------------------------------------------------------
 
     def _log(self, line: LogLine) -> None:
-        if len(line.text) > LONGEST and line.level != "error":  # what somebody sent may be quoted in it
-            line = LogLine(line.level, f"{line.text[:LONGEST]}...", line.every)
-        if line.every:
+        if len(line.text) > LOG_LENGTH_MAX and line.level != "error":  # it may quote a received message
+            line = LogLine(line.level, f"{line.text[:LOG_LENGTH_MAX]}...", line.min_interval)
+        if line.min_interval:
             now, kind = time.monotonic(), _NUMBERS.sub("", line.text)
-            if now - self._said.get(kind, -1e9) < line.every:
+            if now - self._last_logged.get(kind, -1e9) < line.min_interval:
                 return
-            if len(self._said) > MOST_SAID:
-                self._said.clear()
-            self._said[kind] = now
+            if len(self._last_logged) > LOG_KINDS_MAX:
+                self._last_logged.clear()
+            self._last_logged[kind] = now
         logger = self.get_logger()
         if line.level == "error":  # rclpy refuses one call site with two severities
             logger.error(line.text)
@@ -254,48 +254,48 @@ class ComponentNode(Node):
 
     def warn_once(self, text: str) -> None:
         """Log a warning, each text only once."""
-        if text not in self._warned:
-            self._warned.add(text)
+        if text not in self._logged_once:
+            self._logged_once.add(text)
             self.get_logger().warning(text)
 
-    def _beat(self) -> None:
+    def _publish_heartbeat(self) -> None:
         """Repeat the last diagnostics while the component emits none, so that an idle node differs from one that hangs."""
-        if time.monotonic() - self._reported >= HEARTBEAT:
-            self._publish_diagnostics(replace(self._report, stamp=self.get_clock().now().nanoseconds))
+        if time.monotonic() - self._last_report_time >= HEARTBEAT_PERIOD:
+            self._publish_diagnostics(replace(self._last_report, stamp=self.get_clock().now().nanoseconds))
 
     def _publish_diagnostics(self, diagnostics: Diagnostics) -> None:
-        self._reported, self._report = time.monotonic(), diagnostics
-        values = dict(diagnostics.values) | self.host_figures()
+        self._last_report_time, self._last_report = time.monotonic(), diagnostics
+        values = dict(diagnostics.values) | self.host_diagnostics()
         for name, durations in self._durations.items():
             values |= durations_us(name, durations)
         level = diagnostics.level
         if self._failures:
             values["failures"], level = self._failures, 2
-        shown = Diagnostics(diagnostics.stamp, values, level, diagnostics.message)
-        message = diagnostics_message(shown, self.get_fully_qualified_name())
-        message.status[0].hardware_id = self._process
+        extended = Diagnostics(diagnostics.stamp, values, level, diagnostics.message)
+        message = diagnostics_message(extended, self.get_fully_qualified_name())
+        message.status[0].hardware_id = self._process_name
         self._diagnostics.publish(message)
 
-    def host_figures(self) -> dict[str, Any]:
+    def host_diagnostics(self) -> dict[str, Any]:
         """Return the values that the host adds to the diagnostics."""
         return {}
 
-    def guarded(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
+    def guarded(self, name: str, work: Callable[..., None], *arguments: Any) -> None:
         """Call the component and record the duration; an exception is logged, its value is dropped, and the node continues."""
         begin = time.perf_counter()
         try:
             work(*arguments)
         except Exception as error:
-            self.refused(what, error)
-        self._durations[what].append(time.perf_counter() - begin)
+            self.log_refusal(name, error)
+        self._durations[name].append(time.perf_counter() - begin)
 
-    def refused(self, what: str, error: Exception) -> None:
-        """Log a refusal; any exception but a `PerchError` counts as a defect. Call it while the exception is being handled."""
+    def log_refusal(self, name: str, error: Exception) -> None:
+        """Log a refusal; any exception but a `PerchError` counts as a failure. Call it while the exception is being handled."""
         if isinstance(error, PerchError):
-            self._log(LogLine("warning", f"{what} refused: {error}", every=1.0))
+            self._log(LogLine("warning", f"{name} refused: {error}", min_interval=1.0))
             return
         self._failures += 1
-        self._log(LogLine("error", f"{what}: a defect of this node, its value is dropped:\n{traceback.format_exc()}", every=1.0))
+        self._log(LogLine("error", f"{name}: unexpected exception, value dropped:\n{traceback.format_exc()}", min_interval=1.0))
 
     def close(self) -> None:
         """Release the resources of the component and its jobs."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection, Iterable
 
-WINDOW = 500        # answers from which the clocks' offset and the figures are taken
+WINDOW = 500  # answers from which the clocks' offset and the figures are taken
 NEVER = 1 << 62
-MOVED = 50          # so many late answers on end: stamps have lost time to the wall clock (a vehicle catches up 25 steps at most)
+# After so many late answers in a row, stamps have lost time to the wall clock: a vehicle catches up 25 steps at most.
+LATE_IN_A_ROW_MAX = 50
 
 
 def median_and_p99(samples: Iterable[float]) -> tuple[float, float]:
@@ -31,39 +32,39 @@ class Deadlines:
     least value over the last `WINDOW` answers belongs to an undelayed answer. A deadline is *missed* when an answer leaves more
     than one period later than that: its successor was due by then. Delays count whether caused by the vehicle, the node or
     the operating system. The period is that of the stamps, whatever the IMU's rate. Where the vehicle skips time that it
-    cannot catch up, the stamps stay behind the wall clock: `MOVED` late answers in a row count as missed, then their least
-    offset is taken as undelayed. In simulated time there are no deadlines, and this class is not used.
+    cannot catch up, the stamps stay behind the wall clock: `LATE_IN_A_ROW_MAX` late answers in a row count as missed, then their
+    least offset is taken as undelayed. In simulated time there are no deadlines, and this class is not used.
     """
 
     def __init__(self) -> None:
         self.answers = 0
         self.missed = 0
-        self._last: int | None = None
-        self._period = self._coming_period = NEVER  # least interval of stamps, as `_least`
-        self._least = self._coming = self._fresh = 0  # least offset of the last window and of the present one; its length
-        self._on_end = self._on_end_least = 0  # late answers in a row and their least offset
+        self._last_stamp: int | None = None
+        self._period = self._window_period = NEVER  # least interval of stamps, as `_least`
+        self._least = self._window_least = self._window_count = 0  # least offset of the last and the current window; its length
+        self._late_in_a_row = self._late_least = 0  # late answers in a row and their least offset
         self._lateness: deque[int] = deque(maxlen=WINDOW)
 
-    def answered(self, stamp: int, now: int) -> None:
+    def record_answer(self, stamp: int, now: int) -> None:
         """Record an answer that has been sent.
 
         Args:
             stamp: stamp of the answered step [ns].
             now: time of a monotonic clock [ns].
         """
-        offset, last = now - stamp, self._last
-        self._last = stamp
-        if self._fresh == 0:
-            self._least, self._coming = (offset if last is None else self._coming), offset
-            self._period, self._coming_period = self._coming_period, NEVER
-        self._fresh = (self._fresh + 1) % WINDOW
-        if offset < self._coming:
-            self._coming = offset
+        offset, last = now - stamp, self._last_stamp
+        self._last_stamp = stamp
+        if self._window_count == 0:
+            self._least, self._window_least = (offset if last is None else self._window_least), offset
+            self._period, self._window_period = self._window_period, NEVER
+        self._window_count = (self._window_count + 1) % WINDOW
+        if offset < self._window_least:
+            self._window_least = offset
         interval = 0 if last is None else stamp - last
-        if 0 < interval < self._coming_period:
-            self._coming_period = interval
-        period = min(self._period, self._coming_period)
-        lateness = offset - min(self._least, self._coming)
+        if 0 < interval < self._window_period:
+            self._window_period = interval
+        period = min(self._period, self._window_period)
+        lateness = offset - min(self._least, self._window_least)
         self._lateness.append(lateness)
         self.answers += 1
         if 2 * interval >= 3 * period:
@@ -71,13 +72,13 @@ class Deadlines:
             self.answers += skipped
             self.missed += skipped
         if lateness <= period:
-            self._on_end = 0
+            self._late_in_a_row = 0
             return
         self.missed += 1
-        self._on_end += 1
-        self._on_end_least = offset if self._on_end == 1 else min(self._on_end_least, offset)
-        if self._on_end == MOVED:
-            self._least = self._coming = self._on_end_least
+        self._late_in_a_row += 1
+        self._late_least = offset if self._late_in_a_row == 1 else min(self._late_least, offset)
+        if self._late_in_a_row == LATE_IN_A_ROW_MAX:
+            self._least = self._window_least = self._late_least
 
     def report(self) -> dict[str, int | float]:
         """Figures for /diagnostics: counts since the start, and the delay of the last `WINDOW` answers."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from perch_core.ros.late_service import WAITING
+from perch_core.ros.late_service import QUEUE_SIZE
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.node import Node
@@ -29,9 +29,9 @@ class GoalServer(ActionServer):
             accept: returns whether a goal is accepted.
         """
         self._begin = begin
-        kept = QoSProfile(depth=WAITING)
-        super().__init__(node, action, name, self._refuse_to_wait, goal_callback=accept, cancel_callback=lambda _: CancelResponse.ACCEPT,
-                         goal_service_qos_profile=kept, result_service_qos_profile=kept, cancel_service_qos_profile=kept)
+        profile = QoSProfile(depth=QUEUE_SIZE)
+        super().__init__(node, action, name, self._never_executed, goal_callback=accept, cancel_callback=lambda _: CancelResponse.ACCEPT,
+                         goal_service_qos_profile=profile, result_service_qos_profile=profile, cancel_service_qos_profile=profile)
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Any) -> None:
         """Start the goal; rclpy calls this when it is accepted."""
@@ -42,7 +42,7 @@ class GoalServer(ActionServer):
         super().notify_execute(goal_handle, lambda _: result)
 
     @staticmethod
-    def _refuse_to_wait(_: ServerGoalHandle) -> None:
+    def _never_executed(_: ServerGoalHandle) -> None:
         raise AssertionError("goals of a GoalServer end with finish()")
 
 
@@ -74,6 +74,6 @@ class ServedGoal:
             self._handle.abort()
         self._server.finish(self._handle, self._row.result_message(result))
 
-    def reject(self, why: str) -> None:
+    def reject(self, reason: str) -> None:
         """Abort the goal with the reason for its rejection."""
-        self.finish("aborted", self._row.rejected(why))
+        self.finish("aborted", self._row.rejected(reason))

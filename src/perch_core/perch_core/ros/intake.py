@@ -16,9 +16,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
-MATCH = 1.0  # publishers of topics that are kept are looked at this often [s]
-TAKE = 0.02  # lazy inputs are taken this often where nothing else asks for them [s]
-SHARED = ("/tf", "/tf_static")  # topics with many writers, inside this process and outside
+MATCH_PERIOD = 1.0  # of the check of the publishers' reliability for raw inputs [s]
+TAKE_PERIOD = 0.02  # lazy inputs are read at least this often [s]
+SHARED_TOPICS = ("/tf", "/tf_static")  # topics with many publishers, inside this process and outside
 
 
 class Intake:
@@ -31,7 +31,7 @@ class Intake:
     def __init__(self, node: ComponentNode) -> None:
         self._node, self._wiring = node, node.wiring
         self._lazy: list[tuple[Subscription, Callable[[bytes], None]]] = []
-        self._kept: list[tuple[Subscription, Input[Any], topics.Topic, Callable[[bytes], None]]] = []
+        self._raw_best_effort: list[tuple[Subscription, Input[Any], topics.Topic, Callable[[bytes], None]]] = []
         self.private: set[str] = set()
 
     def add(self, port: Input[Any]) -> None:
@@ -44,38 +44,38 @@ class Intake:
             return
         resolved = node.resolve_topic_name(channel)
         handler = partial(node.guarded, port.name, port.handler(node.component))
-        if self._wiring.writer(resolved) is not None and resolved not in SHARED:
+        if self._wiring.writer(resolved) is not None and resolved not in SHARED_TOPICS:
             self.private.add(resolved)
-            self._wiring.add_reader(resolved, self._local(port, row, channel, resolved, handler))
+            self._wiring.add_reader(resolved, self._local_receiver(port, row, channel, resolved, handler))
             return
         if port.value is not Serialized:
             self._subscribe(port, row, _Reader(node, channel, row, handler), row.qos.subscribe)
             return
         receive = partial(self._receive_raw, row, resolved, handler)
-        subscription = self._subscribe(port, row, receive, qos.kept(row.qos))
+        subscription = self._subscribe(port, row, receive, qos.recording_profile(row.qos))
         if row.qos.subscribe.reliability is ReliabilityPolicy.BEST_EFFORT:
-            if not self._kept:
-                node.create_timer(MATCH, lambda: self._wiring.enter(self._match_publishers), clock=Clock(clock_type=ClockType.STEADY_TIME))
-            self._kept.append((subscription, port, row, receive))
+            if not self._raw_best_effort:
+                node.create_timer(MATCH_PERIOD, lambda: self._wiring.enter(self._match_publishers), clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self._raw_best_effort.append((subscription, port, row, receive))
 
     def _subscribe(self, port: Input[Any], row: topics.Topic, receive: Callable[[bytes], None], profile: QoSProfile) -> Subscription:
         node, channel = self._node, port.channel(self._node.component)
         if not port.lazy:
             return node.create_subscription(row.message, channel, partial(self.enter, receive), profile, raw=True)
         if not self._lazy:
-            node.create_timer(TAKE, lambda: self._wiring.enter(self.take_lazy), clock=Clock(clock_type=ClockType.STEADY_TIME))
+            node.create_timer(TAKE_PERIOD, lambda: self._wiring.enter(self.take_lazy), clock=Clock(clock_type=ClockType.STEADY_TIME))
         subscription = node.create_unwatched(row.message, channel, profile)
         self._lazy.append((subscription, receive))
         return subscription
 
     def _match_publishers(self) -> None:
         """Resubscribe as best effort to topics with a best-effort publisher, which a reliable subscription does not match."""
-        for kept in tuple(self._kept):
-            subscription, port, row, receive = kept
+        for entry in tuple(self._raw_best_effort):
+            subscription, port, row, receive = entry
             publishers = self._node.get_publishers_info_by_topic(subscription.topic_name)
             if any(one.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT for one in publishers):
-                self._kept.remove(kept)
-                self._subscribe(port, row, receive, qos.kept(row.qos, ReliabilityPolicy.BEST_EFFORT))
+                self._raw_best_effort.remove(entry)
+                self._subscribe(port, row, receive, qos.recording_profile(row.qos, ReliabilityPolicy.BEST_EFFORT))
                 self._lazy = [one for one in self._lazy if one[0] is not subscription]
                 self._node.destroy_subscription(subscription)
 
@@ -87,7 +87,7 @@ class Intake:
                     receive(taken[0])
 
     @staticmethod
-    def _local(port: Input[Any], row: topics.Topic, channel: str, topic: str, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _local_receiver(port: Input[Any], row: topics.Topic, channel: str, topic: str, handler: Callable[[Any], None]) -> Callable[[Any], None]:
         if port.value is not Serialized:
             return handler
         return lambda value: handler(Serialized(topic, getattr(value, "stamp", 0), topics.encode(channel, value), row.message))
@@ -113,19 +113,19 @@ class _Reader:
     def __call__(self, data: bytes) -> None:
         """Pass the values of a serialised message to the handler."""
         try:
-            if self._row.often:
-                self._count_it()
+            if self._row.rate_max:
+                self._check_rate()
             value = self._row.read(data)
         except Exception as error:
-            self._node.refused(self._channel, error)
+            self._node.log_refusal(self._channel, error)
             return
         for one in value if isinstance(value, list) else (value,):
             self._handler(one)
 
-    def _count_it(self) -> None:
+    def _check_rate(self) -> None:
         second = int(time.monotonic())
         if second != self._second:
             self._second, self._count = second, 0
         self._count += 1
-        if self._count > self._row.often:
-            raise PerchError(f"more than {self._row.often} messages in a second")
+        if self._count > self._row.rate_max:
+            raise PerchError(f"more than {self._row.rate_max} messages in a second")

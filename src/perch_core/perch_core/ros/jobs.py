@@ -31,7 +31,7 @@ class Jobs:
             PerchError: what they need cannot be loaded.
         """
         if self._process is not None and not self._process.wait_ready():
-            raise PerchError("the process for isolated jobs does not come up")
+            raise PerchError("the process for isolated jobs did not start within its time-out")
 
     def submit(self, job: Job) -> None:
         """Submit a job; it begins after the jobs before it, and `job.then` receives its result."""

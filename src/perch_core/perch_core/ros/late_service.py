@@ -8,7 +8,7 @@ from typing import Any, cast
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-WAITING = 1000
+QUEUE_SIZE = 1000
 """Queue size of requests, and of responses that a client has not yet taken; by default, ROS silently drops all but ten."""
 
 
@@ -20,24 +20,24 @@ class LateService:
     response, which is not sent, and the request's header is kept for the actual one.
     """
 
-    def __init__(self, node: Node, srv_type: Any, name: str, take: Callable[[Any, Callable[[Any], None]], None]) -> None:
+    def __init__(self, node: Node, srv_type: Any, name: str, handle_request: Callable[[Any, Callable[[Any], None]], None]) -> None:
         """
         Args:
             node: node that offers the service.
             srv_type: type of the service.
             name: name of the service.
-            take: called with a request and the function that sends its response, once.
+            handle_request: called with a request and the function that sends its response, once.
         """
-        self._take = take
+        self._handle_request = handle_request
         self._requests: dict[int, Any] = {}  # by the identity of the empty response that stands for the answer
-        self._service = cast(Any, node.create_service(srv_type, name, self._receive, qos_profile=QoSProfile(depth=WAITING)))
+        self._service = cast(Any, node.create_service(srv_type, name, self._receive, qos_profile=QoSProfile(depth=QUEUE_SIZE)))
         self._send = self._service.send_response
-        self._service.send_response = self._keep_header
+        self._service.send_response = self._store_header
 
     def _receive(self, request: Any, response: Any) -> Any:
         self._requests[id(response)] = request
         return response
 
-    def _keep_header(self, response: Any, header: Any) -> None:
+    def _store_header(self, response: Any, header: Any) -> None:
         request = self._requests.pop(id(response))
-        self._take(request, lambda answer: self._send(answer, header))
+        self._handle_request(request, lambda answer: self._send(answer, header))

@@ -18,8 +18,8 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.processes import end_within, freeze_heap
 from perch_core.registry import resolved
 from perch_core.ros.arrival import ArrivalNode
-from perch_core.ros.joining import join
 from perch_core.ros.priority import priority
+from perch_core.ros.ros_init import init_ros
 from perch_core.ros.wiring import Wiring
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor
@@ -27,13 +27,13 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 
-LOOK = 0.1  # [s] wall clock, between looks for a signal to stop
-END_LIMIT = 20  # for the end of a process whose nodes are told to stop [s]
-LOCKSTEP = "perch_sim.ros.participant_node:ParticipantNode"  # the host that the simulator brings; nothing here knows the simulator otherwise
+CHECK_PERIOD = 0.1     # of the check for a stop signal, wall clock [s]
+SHUTDOWN_TIMEOUT = 20  # for the end of a process after its stop signal [s]
+LOCKSTEP = "perch_sim.ros.participant_node:ParticipantNode"  # the simulator's host: perch_core's only reference to it
 
 
 @dataclass(frozen=True)
-class NodeOf:
+class NodeSpec:
     """A node that can be started.
 
     Attributes:
@@ -56,10 +56,10 @@ class NodeOf:
         Raises:
             ConfigError: a parameter is refused.
         """
-        with _given(self.name, kwargs, {"lockstep": bool, "type": str}) as given:
+        with _selecting_parameters(self.name, kwargs, {"lockstep": bool, "type": str}) as values:
             wiring = wiring or Wiring()
-            component = self.choose(given["type"]) if self.choose is not None and "type" in given else self.component
-            if given.get("lockstep"):
+            component = self.choose(values["type"]) if self.choose is not None and "type" in values else self.component
+            if values.get("lockstep"):
                 lockstep: type[ComponentNode] = resolved(self.lockstep)
                 return lockstep(self.name, component, wiring, **kwargs)
             return ArrivalNode(self.name, component, wiring, deadline=self.deadline, **kwargs)
@@ -70,13 +70,13 @@ class NodeOf:
 
 
 def node(name: str, component: type[Component[Any]], deadline: str = "", lockstep: str = LOCKSTEP,
-         choose: Callable[[str], type[Component[Any]]] | None = None) -> NodeOf:
-    """Return a `NodeOf`. Node files have `NODE = node("controller", Controller)` and `create, main = NODE.create, NODE.main`."""
-    return NodeOf(name, component, deadline, lockstep, choose)
+         choose: Callable[[str], type[Component[Any]]] | None = None) -> NodeSpec:
+    """Return a `NodeSpec`. Node files have `NODE = node("controller", Controller)` and `create, main = NODE.create, NODE.main`."""
+    return NodeSpec(name, component, deadline, lockstep, choose)
 
 
 @contextmanager
-def _given(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> Iterator[dict[str, Any]]:
+def _selecting_parameters(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> Iterator[dict[str, Any]]:
     """Yield the given values of the parameters that decide the node's class, read from a probe node of the same name.
 
     The probe ends before the node is created: two nodes of one name are one in the graph, and the publishers of the node would
@@ -87,12 +87,12 @@ def _given(name: str, kwargs: dict[str, Any], kinds: dict[str, type]) -> Iterato
     keeper = Node(f"_{name}_starting", use_global_arguments=False, context=kwargs.get("context"), **plain)
     try:
         probe = Node(name, **plain, **{k: v for k, v in kwargs.items() if k != "wiring"})
-        given = {key: parameter.value for key, parameter in probe._parameter_overrides.items() if key in kinds}
+        values = {key: parameter.value for key, parameter in probe._parameter_overrides.items() if key in kinds}
         probe.destroy_node()
-        for key, value in given.items():
+        for key, value in values.items():
             if not isinstance(value, kinds[key]):
                 raise ConfigError(name, key, f"{value!r} is not of type {kinds[key].__name__}")
-        yield given
+        yield values
     finally:
         keeper.destroy_node()
 
@@ -101,20 +101,20 @@ class StopSignal:
     """Flag that becomes true on SIGINT or SIGTERM.
 
     rclpy's own handlers raise an exception in the running callback, which EventsExecutor cannot propagate; a flag lets the
-    callback finish. Until `patient` is set, no callback of ROS runs, and a signal ends the process at once by SystemExit.
+    callback finish. Until `defer` is set, no callback of ROS runs, and a signal ends the process at once by SystemExit.
     Python's messages about ignored exceptions are then suppressed: where C code has called Python (as numba does to load its
     cache), SystemExit is lost and the flag ends the process; objects under construction fail when they are deleted.
     """
 
     def __init__(self) -> None:
-        self._set = self.patient = False
-        others, sys.unraisablehook = sys.unraisablehook, lambda lost: None if self and not self.patient else others(lost)
+        self._set = self.defer = False
+        hook, sys.unraisablehook = sys.unraisablehook, lambda error: None if self and not self.defer else hook(error)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._handle)
 
     def _handle(self, *_: Any) -> None:
         self._set = True
-        if not self.patient:
+        if not self.defer:
             raise SystemExit(0)
 
     def __bool__(self) -> bool:
@@ -130,19 +130,19 @@ def spin_until_stopped(executor: Executor, stop: StopSignal) -> None:
     """
     stopped = Future()
 
-    def look() -> None:
+    def check_stop() -> None:
         if stop and not stopped.done():
             stopped.set_result(None)
 
-    next(iter(executor.get_nodes())).create_timer(LOOK, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    next(iter(executor.get_nodes())).create_timer(CHECK_PERIOD, check_stop, clock=Clock(clock_type=ClockType.STEADY_TIME))
     while not stop and rclpy.ok():
-        executor.spin_until_future_complete(stopped, timeout_sec=LOOK)
+        executor.spin_until_future_complete(stopped, timeout_sec=CHECK_PERIOD)
 
 
 def connect(nodes: Sequence[ComponentNode], executor: Any) -> None:
     """Connect nodes that share a process, when all of them exist."""
     for one in nodes:
-        one.take_time_here()
+        one.use_local_clock()
         executor.add_node(one)
         one.connect()
     for one in nodes:
@@ -151,24 +151,24 @@ def connect(nodes: Sequence[ComponentNode], executor: Any) -> None:
 
 def close_nodes(nodes: Sequence[ComponentNode]) -> None:
     """Release threads, processes and files of all nodes, last node first, then destroy the nodes, even if one raises."""
-    with ExitStack() as endings:
+    with ExitStack() as stack:
         for one in nodes:
-            endings.callback(one.destroy_node)
+            stack.callback(one.destroy_node)
         for one in nodes:
-            endings.callback(one.close)
+            stack.callback(one.close)
 
 
 def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | None) -> NoReturn:
     """Run the nodes that `create` returns until SIGINT or SIGTERM.
 
     Exit code 0, or 2 when a parameter is refused. Fast DDS 2.14 may wait for ever where a participant ends while one of its
-    readers is notified of a message, even in the C library's exit: after `END_LIMIT`, SIGALRM ends the process.
+    readers is notified of a message, even in the C library's exit: after `SHUTDOWN_TIMEOUT`, SIGALRM ends the process.
     """
     nodes: list[ComponentNode] = []
     stop = StopSignal()
     try:
         _check_parameter_files(sys.argv if args is None else args)
-        join(args)
+        init_ros(args)
         nodes += create(Wiring())
         priority.nodes = len(nodes)
         executor = EventsExecutor()
@@ -177,8 +177,8 @@ def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | N
         freeze_heap()
         for one in nodes:
             if isinstance(one, ArrivalNode):
-                one.wiring.from_thread(one.hurry)  # while it spins: the executor's threads are raised, too
-        stop.patient = True
+                one.wiring.from_thread(one.request_real_time)  # while it spins: the executor's threads are raised, too
+        stop.defer = True
         spin_until_stopped(executor, stop)
     except (PerchError, rclpy.exceptions.InvalidParameterValueException, rclpy.exceptions.InvalidParameterTypeException) as error:
         _refuse(str(error))
@@ -187,7 +187,7 @@ def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | N
             raise
         _refuse(" ".join(str(error).split()))  # rcl refuses command lines and parameter files with this one
     finally:
-        end_within(END_LIMIT)
+        end_within(SHUTDOWN_TIMEOUT)
         close_nodes(nodes)
         rclpy.try_shutdown()
     sys.exit(0)

@@ -31,11 +31,11 @@ IMAGE = Qos(_profile(5), _profile(5, reliable=False))             # images, came
 STATE = Qos(_profile(50), _profile(50))                           # statuses, results of perception
 ORDER = Qos(_profile(50), _profile(50))                           # trajectories, commands
 LATCHED = Qos(_profile(1, latched=True), _profile(1, latched=True))         # facts, the newest map
-EVENT = Qos(_profile(100, latched=True), _profile(100, latched=True))       # contacts: all of them, also for who comes late
+EVENT = Qos(_profile(100, latched=True), _profile(100, latched=True))       # contacts: all of them, also for late subscribers
 STATIC = Qos(_profile(50, latched=True), _profile(50, latched=True))        # /tf_static
 CLOCK = Qos(_profile(10), _profile(10, reliable=False))
 
 
-def kept(purpose: Qos, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
+def recording_profile(purpose: Qos, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> QoSProfile:
     """Return the profile of a subscriber that records every message of a topic, with a queue for seconds of messages."""
     return QoSProfile(depth=2000, reliability=reliability, durability=purpose.publish.durability)

@@ -15,13 +15,14 @@ FOLDER = Path("/dev/shm")
 PORT = re.compile(r"fast(?:rtps|dds)_port\d+")
 """Names of segments that any process may create: those in which participants receive. Others are announced once complete."""
 INITIALIZED, CORRUPTED = 2, 3
-PATIENCE = 1.0  # after which the maker of an unfinished segment is taken for dead [s]
+CREATION_TIMEOUT = 1.0  # after which the creator of an unfinished segment is considered dead [s]
 
 
-def end_unfinished(folder: Path = FOLDER) -> list[Path]:
+def remove_unfinished_segments(folder: Path = FOLDER) -> list[Path]:
     """Mark unfinished segments as corrupted, so that waiting processes continue, and remove them.
 
-    Waits up to `PATIENCE` for a segment that was created just before; a caller that does this first waits no longer than that.
+    Waits up to `CREATION_TIMEOUT` for a segment that was created just before; a caller that does this first
+    waits no longer than that.
 
     Returns:
         The removed files.
@@ -30,7 +31,7 @@ def end_unfinished(folder: Path = FOLDER) -> list[Path]:
     for file in folder.iterdir() if folder.is_dir() else ():
         with suppress(OSError):  # gone already, or another user's
             if PORT.fullmatch(file.name) and _unfinished(file):
-                time.sleep(max(0.0, PATIENCE - (time.time() - file.stat().st_mtime)))
+                time.sleep(max(0.0, CREATION_TIMEOUT - (time.time() - file.stat().st_mtime)))
                 if _unfinished(file):
                     with file.open("r+b") as segment:
                         segment.write(CORRUPTED.to_bytes(4, "little"))

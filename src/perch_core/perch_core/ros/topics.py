@@ -51,8 +51,8 @@ class Topic:
         to_message: value to message.
         to_value: message to value, or to a list of values; raises PerchError for a message that cannot be converted.
         observed: for observers only; no component in flight waits for it.
-        largest: greatest size of a message that is read [bytes].
-        often: greatest number of messages per second that a node reads; 0: no limit.
+        size_max: greatest size of a message that is read [bytes].
+        rate_max: greatest number of messages per second that a node reads; 0: no limit.
         pack, unpack: value to serialised message and back without rclpy's objects, for topics at 500 Hz.
         """
 
@@ -64,8 +64,8 @@ class Topic:
     pack: Callable[[Any], bytes] | None = None
     unpack: Callable[[bytes], Any] | None = None
     observed: bool = False
-    largest: int = 256 << 10
-    often: int = 0
+    size_max: int = 256 << 10
+    rate_max: int = 0
 
     def read(self, data: bytes) -> Any:
         """Return the value of a serialised message, or a list of values.
@@ -73,8 +73,8 @@ class Topic:
         Raises:
             PerchError: the message is larger than allowed, or cannot be converted.
         """
-        if len(data) > self.largest:
-            raise PerchError(f"{len(data)} bytes are more than {self.largest}")
+        if len(data) > self.size_max:
+            raise PerchError(f"{len(data)} bytes are more than {self.size_max}")
         return self.unpack(data) if self.unpack is not None else self.to_value(deserialize_message(data, self.message))
 
     @property
@@ -86,23 +86,23 @@ class Topic:
 TOPICS = (
     Topic("imu/data_raw", Imu, qos.SENSOR, sensing.imu_message, sensing.imu_value,
           fast.pack_imu, fast.unpack_imu),
-    Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.image_message, sensing.image_value, largest=IMAGE_MAX, often=300),
-    Topic("camera_*/image_raw/compressed", CompressedImage, qos.IMAGE, sensing.compressed_message, sensing.compressed_value, largest=IMAGE_MAX,
-          often=300),
-    Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value, often=300),
-    Topic("vio/debug_image", Image, qos.IMAGE, sensing.image_message, sensing.image_value, largest=IMAGE_MAX),
+    Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.image_message, sensing.image_value, size_max=IMAGE_MAX, rate_max=300),
+    Topic("camera_*/image_raw/compressed", CompressedImage, qos.IMAGE, sensing.compressed_message, sensing.compressed_value, size_max=IMAGE_MAX,
+          rate_max=300),
+    Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value, rate_max=300),
+    Topic("vio/debug_image", Image, qos.IMAGE, sensing.image_message, sensing.image_value, size_max=IMAGE_MAX),
     Topic("vio/odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
           fast.pack_odometry, fast.unpack_odometry),
     Topic("vio/state", VioState, qos.SENSOR, states.inertial_message, states.inertial_value),
     Topic("odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
           fast.pack_odometry, fast.unpack_odometry),
     Topic("estimator/status", EstimatorStatus, qos.STATE, states.health_message, states.health_value),
-    Topic("target/pose", PoseWithCovarianceStamped, qos.LATCHED, perching.target_message, perching.target_value, often=500),
+    Topic("target/pose", PoseWithCovarianceStamped, qos.LATCHED, perching.target_message, perching.target_value, rate_max=500),
     Topic("target/detections", TargetDetection, qos.STATE, perching.sighting_message, perching.sighting_value),
-    Topic("powerlines", PowerlineArray, qos.LATCHED, perching.map_message, perching.map_value, often=100),
-    Topic("trajectory", Trajectory, qos.ORDER, flight.order_message, flight.order_value, largest=TRAJECTORY_MAX, often=50),
-    Topic("recovery", Trajectory, qos.ORDER, flight.order_message, flight.order_value, largest=TRAJECTORY_MAX, often=50),
-    Topic("controller/command", ControllerCommand, qos.ORDER, flight.command_message, flight.command_value, often=500),
+    Topic("powerlines", PowerlineArray, qos.LATCHED, perching.map_message, perching.map_value, rate_max=100),
+    Topic("trajectory", Trajectory, qos.ORDER, flight.order_message, flight.order_value, size_max=TRAJECTORY_MAX, rate_max=50),
+    Topic("recovery", Trajectory, qos.ORDER, flight.order_message, flight.order_value, size_max=TRAJECTORY_MAX, rate_max=50),
+    Topic("controller/command", ControllerCommand, qos.ORDER, flight.command_message, flight.command_value, rate_max=500),
     Topic("controller/status", ControllerStatus, qos.STATE, flight.status_message, flight.status_value),
     Topic("controller/reference", ControlReference, qos.STATE, flight.reference_message, flight.reference_value, observed=True),
     Topic("motor_command", MotorCommand, qos.SENSOR, flight.motor_message, flight.motor_value,
@@ -123,7 +123,7 @@ TOPICS = (
 
 
 def _no_client(_: Any) -> Any:
-    raise PerchError("nobody here asks for this service")
+    raise PerchError("this service has no client conversions")
 
 
 @dataclass(frozen=True)
@@ -145,9 +145,9 @@ SERVICES = (
                planning.perch_plan_value),
     ServiceRow("plan_powerline", PlanPowerline, planning.powerline_request_value, planning.powerline_plan_message,
                planning.powerline_request_message, planning.powerline_plan_value),
-    ServiceRow("set_controller", SetController, flight.choose_law_value, flight.law_chosen_message),
-    ServiceRow("abort", Trigger, flight.ask_value, flight.done_message),
-    ServiceRow("depart", Trigger, flight.ask_value, flight.done_message),
+    ServiceRow("set_controller", SetController, flight.set_controller_request_value, flight.set_controller_response_message),
+    ServiceRow("abort", Trigger, flight.trigger_request_value, flight.trigger_response_message),
+    ServiceRow("depart", Trigger, flight.trigger_request_value, flight.trigger_response_message),
 )
 
 
@@ -184,8 +184,8 @@ def topic(channel: str) -> Topic:
     """
     parts = channel.split("/")
     for row in _rows():
-        wanted = row.channel.split("/")
-        if len(wanted) == len(parts) and all(w == p or (w.endswith("*") and p.startswith(w[:-1])) for w, p in zip(wanted, parts)):
+        pattern = row.channel.split("/")
+        if len(pattern) == len(parts) and all(w == p or (w.endswith("*") and p.startswith(w[:-1])) for w, p in zip(pattern, parts)):
             return row
     raise PerchError(f"no topic {channel!r} in perch_core.ros.topics")
 

@@ -17,8 +17,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 UNNAMED = "_NODE_NAME_UNKNOWN_"  # of rcl, for a publisher that was discovered before its node
-LOOK = 0.1      # between two looks at who listens: asking the middleware takes 5 us [s]
-BUNDLE = 0.008  # what may wait leaves this often [s]
+CHECK_PERIOD = 0.1     # of the check for subscribers, which takes 5 us [s]
+BUNDLE_PERIOD = 0.008  # of the publication of messages without urgency [s]
 
 Receive = Callable[[Any], None]
 
@@ -38,20 +38,20 @@ class Publication:
         """
         self._publisher, self._to_message, self._always = publisher, to_message, always
         self.frequent, self.observed = frequent, observed
-        self._heard, self._looked = False, 0.0
+        self._has_subscribers, self._last_check = False, 0.0
 
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """Return whether the topic has subscribers, or is published without them."""
         if self._always:
             return True
         now = time.monotonic()
-        if now - self._looked > LOOK:
-            self._heard, self._looked = self._publisher.get_subscription_count() > 0, now
-        return self._heard
+        if now - self._last_check > CHECK_PERIOD:
+            self._has_subscribers, self._last_check = self._publisher.get_subscription_count() > 0, now
+        return self._has_subscribers
 
     def send(self, value: Any) -> None:
-        """Publish a value if `heard`."""
-        if self.heard():
+        """Publish a value if `has_subscribers`."""
+        if self.has_subscribers():
             self._publisher.publish(self._to_message(value))
 
 
@@ -60,8 +60,8 @@ class Wiring:
 
     Attributes:
         participants: nodes that take part in a lockstep, by name, for a vehicle in this process.
-        schedule_here: whether that vehicle is in this process.
-        paced: the process has deadlines and handles events every few milliseconds; messages without urgency leave in bundles.
+        hosts_schedule: whether that vehicle is in this process.
+        bundled: the process has deadlines and handles events every few milliseconds; messages without urgency leave in bundles.
         progress: notifies that vehicle that something for which it may be waiting has arrived.
     """
 
@@ -69,19 +69,19 @@ class Wiring:
         self._neighbours: dict[str, list[Receive]] = {}
         self._writers: dict[str, str] = {}  # topic -> node of this process that publishes it
         self._queue: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
-        self._leaving: deque[tuple[Publication, Any]] = deque()
+        self._outgoing: deque[tuple[Publication, Any]] = deque()
         self._working, self._urgent = False, False
-        self._left = 0.0  # when something left the process last, monotonic clock [s]
+        self._last_sent = 0.0  # time of the last publication, monotonic clock [s]
         self._executor: Any = None
-        self._early: deque[tuple[Any, ...]] = deque()  # what threads have done before there was an executor
+        self._pending: deque[tuple[Any, ...]] = deque()  # work that threads have queued before there was an executor
         self.participants: dict[str, Any] = {}  # of a lockstep, in this process
-        self.schedule_here = False              # a lockstep's vehicle is in this process
-        self.paced = False
+        self.hosts_schedule = False             # a lockstep's vehicle is in this process
+        self.bundled = False
         self.progress: Callable[[], None] = lambda: None
 
     # -- connecting --------------------------------------------------------------------------------------------------
 
-    def writes(self, topic: str, node: str) -> None:
+    def register_writer(self, topic: str, node: str) -> None:
         """Register the node of this process that publishes a topic."""
         self._writers[topic] = node
 
@@ -93,7 +93,7 @@ class Wiring:
         """Pass every value of a topic that is published in this process to `receive`."""
         self._neighbours.setdefault(topic, []).append(receive)
 
-    def read_here(self, topic: str) -> bool:
+    def has_reader(self, topic: str) -> bool:
         """Return whether a node of this process receives a topic directly."""
         return topic in self._neighbours
 
@@ -106,7 +106,7 @@ class Wiring:
             self._queue.append((receive, (value,)))
         if not (publication.observed or (publication.frequent and neighbours)):
             self._urgent = True
-        self._leaving.append((publication, value))
+        self._outgoing.append((publication, value))
         if not self._working:
             self._drain()
 
@@ -117,35 +117,35 @@ class Wiring:
             self._drain()
 
     def _drain(self) -> None:
-        queue, leaving = self._queue, self._leaving
+        queue, outgoing = self._queue, self._outgoing
         self._working = True
         try:
             while queue:
                 work, arguments = queue.popleft()
                 work(*arguments)
-            if leaving and (self._urgent or not self.paced or time.monotonic() - self._left > BUNDLE):
-                while leaving:
-                    publication, value = leaving.popleft()
+            if outgoing and (self._urgent or not self.bundled or time.monotonic() - self._last_sent > BUNDLE_PERIOD):
+                while outgoing:
+                    publication, value = outgoing.popleft()
                     publication.send(value)
-                self._left, self._urgent = time.monotonic(), False
+                self._last_sent, self._urgent = time.monotonic(), False
         finally:
             self._working = False
 
     def run_on(self, executor: Any) -> None:
         """Set the executor that runs the nodes' callbacks, and give it the work that threads have queued before."""
         self._executor = executor
-        while self._early:
-            executor.create_task(self.enter, *self._early.popleft())
+        while self._pending:
+            executor.create_task(self.enter, *self._pending.popleft())
 
     def from_thread(self, work: Callable[..., None], *arguments: Any) -> None:
         """Schedule work on the executor's thread; any thread may call this. Work must not raise: that would end the process."""
         if self._executor is None:
-            self._early.append((work, *arguments))
+            self._pending.append((work, *arguments))
         else:
             self._executor.create_task(self.enter, work, *arguments)
 
 
-def foreign_writers(node: Node, topic: str, known: set[str]) -> list[str]:
+def foreign_publishers(node: Node, topic: str, known: set[str]) -> list[str]:
     """Return the fully qualified names, as far as discovered, of nodes that publish a topic and are not in `known`."""
     found = {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in node.get_publishers_info_by_topic(topic)
              if info.node_name != UNNAMED}

@@ -1,8 +1,8 @@
 """Values that cross ports, each with frames, units and shapes. They are immutable, so a receiver may keep them."""
 
 from perch_core.values.flight import (
-    Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, LawChosen, MotorCommand, RatesThrust,
-    TrajectoryOrder)
+    AtEnd, AttitudeThrust, ControllerCommand, ControllerStatus, ControlReference, MotorCommand, RatesThrust, SetControllerRequest,
+    SetControllerResponse, TrajectoryOrder, TriggerRequest, TriggerResponse)
 from perch_core.values.markers import Marker, Markers, Shape
 from perch_core.values.mission import PerchFeedback, PerchGoal, PerchResult
 from perch_core.values.perching import MappedPowerline, PowerlineMap, TargetPose, TargetSighting
@@ -12,10 +12,10 @@ from perch_core.values.stamps import NANOSECONDS, nanoseconds, seconds
 from perch_core.values.state import Contact, EstimatorHealth, InertialState, OdometryState, PoseStamped, RotorState, rotated
 
 __all__ = [
-    "NANOSECONDS", "Ask", "AtEnd", "AttitudeThrust", "CameraImage", "CameraModel", "Certificate", "ChooseLaw", "CompressedPixels", "Contact",
-    "ControlReference", "ControllerCommand", "ControllerStatus", "Done", "EstimatorHealth", "ImuSample", "InertialState", "LawChosen",
+    "NANOSECONDS", "AtEnd", "AttitudeThrust", "CameraImage", "CameraModel", "Certificate", "CompressedPixels", "Contact",
+    "ControlReference", "ControllerCommand", "ControllerStatus", "EstimatorHealth", "ImuSample", "InertialState",
     "MappedPowerline", "Marker", "Markers", "MotorCommand", "OdometryState", "PerchFeedback", "PerchGoal", "PerchPlan",
-    "PerchPlanRequest", "PerchResult", "PoseStamped", "PowerlineMap", "PowerlinePlan", "PowerlinePlanRequest", "RatesThrust", "RotorState",
-    "Serialized", "Shape", "StampedTransform", "TargetPose", "TargetSighting", "TrajectoryOrder", "Transform", "nanoseconds", "rotated",
-    "seconds",
+    "PerchPlanRequest", "PerchResult", "PoseStamped", "PowerlineMap", "PowerlinePlan", "PowerlinePlanRequest", "RatesThrust",
+    "RotorState", "Serialized", "SetControllerRequest", "SetControllerResponse", "Shape", "StampedTransform", "TargetPose",
+    "TargetSighting", "TrajectoryOrder", "Transform", "TriggerRequest", "TriggerResponse", "nanoseconds", "rotated", "seconds",
 ]

@@ -122,27 +122,27 @@ class ControlReference(NamedTuple):
     moment: Floats
 
 
-class ChooseLaw(NamedTuple):
+class SetControllerRequest(NamedTuple):
     """Request of `set_controller`: the control law, with or without L1 adaptation."""
 
     type: str
     adaptive: bool
 
 
-class LawChosen(NamedTuple):
-    """Answer of `set_controller`; `error_code` as in perch_msgs/srv/SetController."""
+class SetControllerResponse(NamedTuple):
+    """Response of `set_controller`; `error_code` as in perch_msgs/srv/SetController."""
 
     success: bool
     error_code: int
     message: str
 
 
-class Ask(NamedTuple):
+class TriggerRequest(NamedTuple):
     """A request without content (std_srvs/Trigger)."""
 
 
-class Done(NamedTuple):
-    """Answer to `Ask`."""
+class TriggerResponse(NamedTuple):
+    """Response to `TriggerRequest`."""
 
     success: bool
     message: str

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from perch_core.camera import IMAGE_LEAST, EquidistantCamera, PinholeCamera, RadialTangentialCamera
+from perch_core.camera import IMAGE_SIZE_MIN, EquidistantCamera, PinholeCamera, RadialTangentialCamera
 from perch_core.errors import ConfigError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
-from perch_core.values.flight import AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, MotorCommand, RatesThrust, TrajectoryOrder
+from perch_core.values.flight import (
+    AttitudeThrust, ControllerCommand, ControllerStatus, MotorCommand, RatesThrust, SetControllerRequest, TrajectoryOrder)
 from perch_core.values.mission import PerchGoal
 from perch_core.values.perching import MappedPowerline, PowerlineMap, TargetPose
 from perch_core.values.planning import PerchPlanRequest, PowerlinePlanRequest
@@ -25,7 +26,7 @@ from perch_core.values.sensing import CameraImage, CameraModel, ImuSample, Trans
 from perch_core.values.stamps import NANOSECONDS
 from perch_core.values.state import EstimatorHealth, InertialState, OdometryState
 
-_SHOWN = 60  # characters of a refused text that are quoted
+_QUOTED_MAX = 60  # characters of a refused text that are quoted
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,8 @@ class Limit:
     Attributes:
         low, high: inclusive.
         unit: of the values.
-        shape: shape of the array; (): a number; -1: any size, along the first axis up to `most`.
-        most: greatest number of rows.
+        shape: shape of the array; (): a number; -1: any size, along the first axis up to `rows_max`.
+        rows_max: greatest number of rows.
         optional: NaN is allowed and leaves the choice to the receiver.
     """
 
@@ -44,7 +45,7 @@ class Limit:
     high: float
     unit: str = ""
     shape: tuple[int, ...] = ()
-    most: int = 0
+    rows_max: int = 0
     optional: bool = False
 
     def problem(self, value: Any) -> str:
@@ -57,10 +58,10 @@ class Limit:
         if many and len(array.shape) and not array.size:
             return ""
         if array.ndim != len(self.shape) or any(n not in (-1, given) for n, given in zip(self.shape, array.shape)):
-            wanted = " x ".join("n" if n < 0 else str(n) for n in self.shape) or "one"
-            return f"shape {array.shape} is not {wanted}"
-        if many and len(array) > self.most:
-            return f"{len(array)} entries are more than {self.most}"
+            required = " x ".join("n" if n < 0 else str(n) for n in self.shape) or "one"
+            return f"shape {array.shape} is not {required}"
+        if many and len(array) > self.rows_max:
+            return f"{len(array)} entries are more than {self.rows_max}"
         inside = (array >= self.low) & (array <= self.high) | (np.isnan(array) if self.optional else False)
         if np.all(inside):
             return ""
@@ -88,14 +89,14 @@ class Unit:
 
 @dataclass(frozen=True)
 class Covariance:
-    """A covariance matrix; `certain`: symmetric and positive semi-definite; otherwise only its variances are checked.
+    """A covariance matrix; `semidefinite`: symmetric and positive semi-definite; otherwise only its variances are checked.
 
     Attributes:
         absent: a negative first entry is allowed and means that there is no covariance.
     """
 
     size: int
-    certain: bool = True
+    semidefinite: bool = True
     absent: bool = False
 
     def problem(self, value: Any) -> str:
@@ -111,27 +112,27 @@ class Covariance:
             return ""
         if C.diagonal().min() < 0.0:
             return f"a variance of {C.diagonal().min():g} is negative"
-        if self.certain and (np.abs(C - C.T).max() > 1e-5 * scale + 1e-15 or np.linalg.eigvalsh(C)[0] < -1e-6 * scale - 1e-15):
+        if self.semidefinite and (np.abs(C - C.T).max() > 1e-5 * scale + 1e-15 or np.linalg.eigvalsh(C)[0] < -1e-6 * scale - 1e-15):
             return "is not symmetric and positive semi-definite"
         return ""
 
     def __str__(self) -> str:
-        kind = "symmetric, positive semi-definite" if self.certain else "no negative variance"
+        kind = "symmetric, positive semi-definite" if self.semidefinite else "no negative variance"
         return f"{self.size} x {self.size}, {kind}, entries up to {VARIANCE_MAX:g}"
 
 
 @dataclass(frozen=True)
 class Text:
-    """Text of up to `most` characters."""
+    """Text of up to `length_max` characters."""
 
-    most: int
+    length_max: int
 
     def problem(self, value: Any) -> str:
         """Return why a value is refused; empty: it is valid."""
-        return "" if len(value) <= self.most else f"{value[:_SHOWN]!r}...: {len(value)} characters are more than {self.most}"
+        return "" if len(value) <= self.length_max else f"{value[:_QUOTED_MAX]!r}...: {len(value)} characters are more than {self.length_max}"
 
     def __str__(self) -> str:
-        return f"up to {self.most} characters"
+        return f"up to {self.length_max} characters"
 
 
 @dataclass(frozen=True)
@@ -139,16 +140,16 @@ class Each:
     """Several values of one type, each within its own limits."""
 
     kind: type
-    most: int
+    count_max: int
 
     def problem(self, value: Any) -> str:
         """Return why a value is refused; empty: it is valid."""
-        if len(value) > self.most:
-            return f"{len(value)} entries are more than {self.most}"
-        return next((f"[{k}].{said}" for k, one in enumerate(value) if (said := problem(one))), "")
+        if len(value) > self.count_max:
+            return f"{len(value)} entries are more than {self.count_max}"
+        return next((f"[{k}].{reason}" for k, one in enumerate(value) if (reason := problem(one))), "")
 
     def __str__(self) -> str:
-        return f"up to {self.most}, each a {self.kind.__name__}"
+        return f"up to {self.count_max}, each a {self.kind.__name__}"
 
 
 @dataclass(frozen=True)
@@ -169,40 +170,40 @@ def _vector(size: float, unit: str) -> Limit:
     return Limit(-size, size, unit, (3,))
 
 
-def _rows(size: float, unit: str, width: int, most: int) -> Limit:
-    return Limit(-size, size, unit, (-1, width), most)
+def _rows(size: float, unit: str, width: int, rows_max: int) -> Limit:
+    return Limit(-size, size, unit, (-1, width), rows_max)
 
 
 def _coefficients(segments: int) -> Limit:
     return Limit(-1e4, 1e4, "m or rad", (-1, 4, -1), segments)
 
 
-VARIANCE_MAX = 1e8  # of a variance beyond that nobody can say anything, and its square would not be a number
+VARIANCE_MAX = 1e8  # a larger variance carries no information, and its square could overflow
 SEGMENTS_MAX, DEGREE_MAX, SAMPLES_MAX = 1000, 20, 5000  # of a trajectory: 5 s at a sample per ms, 20 s at what the planner gives
-PLAN_LONGEST, PLAN_SEGMENTS_MAX = 600.0, 101  # of what is planned on [s]
+PLAN_DURATION_MAX, PLAN_SEGMENTS_MAX = 600.0, 101  # of what is planned on [s]
 PLAN_LINES_MAX = 100
 
 STAMP = Limit(0, (2**31 - 1) * NANOSECONDS, "ns")
 POSITION, VELOCITY, ACCELERATION = _vector(1e4, "m"), _vector(100.0, "m/s"), _vector(1e3, "m/s^2")
-TURN_RATE = _vector(100.0, "rad/s")  # gyroscopes end at 70 rad/s (4000 deg/s)
+ANGULAR_VELOCITY = _vector(100.0, "rad/s")  # gyroscopes end at 70 rad/s (4000 deg/s)
 _SPECIFIC_THRUST = Limit(0.0, 1e3, "m/s^2")
 FRAME = Text(256)
 ID = Limit(0, 2**32 - 1)
 _PIXELS = Limit(1, 1e4, "px")
 _FOCAL, _CENTRE = Limit(1.0, 1e5, "px"), Limit(-1e5, 1e5, "px")
-_SIDE = Limit(IMAGE_LEAST, 1e4, "px")
+_SIDE = Limit(IMAGE_SIZE_MIN, 1e4, "px")
 _CAMERA = {"width": _SIDE, "height": _SIDE, "fx": _FOCAL, "fy": _FOCAL, "cx": _CENTRE, "cy": _CENTRE}
 _DISTORTED = {**_CAMERA, "coefficients": Limit(-1e3, 1e3, "", (-1,), 8)}
 
 LIMITS: dict[type, dict[str, Any]] = {
-    ImuSample: {"w_B": TURN_RATE, "f_B": _vector(2000.0, "m/s^2"), "frame": FRAME},  # accelerometers end at 2000 m/s^2 (200 g)
+    ImuSample: {"w_B": ANGULAR_VELOCITY, "f_B": _vector(2000.0, "m/s^2"), "frame": FRAME},  # accelerometers end at 2000 m/s^2 (200 g)
     CameraImage: {"width": _PIXELS, "height": _PIXELS, "frame": FRAME},
     CameraModel: {"frame": FRAME, "camera": Part((PinholeCamera, RadialTangentialCamera, EquidistantCamera))},
     PinholeCamera: _CAMERA, RadialTangentialCamera: _DISTORTED, EquidistantCamera: _DISTORTED,
     Transform: {"parent": FRAME, "child": FRAME, "p": POSITION, "q": Unit(1e-2)},  # written by hand
     OdometryState: {
-        "p_WB": POSITION, "q_WB": Unit(), "v_B": VELOCITY, "w_B": TURN_RATE, "pose_covariance": Covariance(6, certain=False),
-        "twist_covariance": Covariance(6, certain=False, absent=True), "frame": FRAME},
+        "p_WB": POSITION, "q_WB": Unit(), "v_B": VELOCITY, "w_B": ANGULAR_VELOCITY, "pose_covariance": Covariance(6, semidefinite=False),
+        "twist_covariance": Covariance(6, semidefinite=False, absent=True), "frame": FRAME},
     InertialState: {
         "p_WB": POSITION, "q_WB": Unit(), "v_WB": VELOCITY, "gyro_bias": _vector(10.0, "rad/s"), "accel_bias": _vector(100.0, "m/s^2"),
         "covariance": Covariance(15), "frame": FRAME},
@@ -214,8 +215,8 @@ LIMITS: dict[type, dict[str, Any]] = {
         "direction_sigma": Limit(0.0, inf, "rad")},
     PowerlineMap: {"stamp": STAMP, "lines": Each(MappedPowerline, 500)},
     MotorCommand: {"rotor_speed": Limit(0.0, 1e4, "rad/s", (4,))},
-    RatesThrust: {"w_B": TURN_RATE, "thrust": _SPECIFIC_THRUST},
-    AttitudeThrust: {"q_WB": Unit(), "w_B": TURN_RATE, "thrust": _SPECIFIC_THRUST},
+    RatesThrust: {"w_B": ANGULAR_VELOCITY, "thrust": _SPECIFIC_THRUST},
+    AttitudeThrust: {"q_WB": Unit(), "w_B": ANGULAR_VELOCITY, "thrust": _SPECIFIC_THRUST},
     ControllerCommand: {"command": Limit(0, 5)},
     TrajectoryOrder: {
         "id": ID, "at_end": Limit(0, 3), "contact_time": Limit(0.0, 60.0, "s"), "recovery_start": Limit(-inf, 3600.0, "s"),
@@ -228,7 +229,7 @@ LIMITS: dict[type, dict[str, Any]] = {
         "p": _rows(1e4, "m", 3, SAMPLES_MAX), "v": _rows(100.0, "m/s", 3, SAMPLES_MAX), "a": _rows(1e3, "m/s^2", 3, SAMPLES_MAX),
         "q": _rows(1.1, "", 4, SAMPLES_MAX), "w": _rows(100.0, "rad/s", 3, SAMPLES_MAX), "dw": _rows(1e5, "rad/s^2", 3, SAMPLES_MAX),
         "rotor_thrust": _rows(1e3, "N", 4, SAMPLES_MAX)},
-    ChooseLaw: {"type": Text(100)},
+    SetControllerRequest: {"type": Text(100)},
     PerchGoal: {
         "takeoff_height": Limit(0.3, 10.0, "m", optional=True), "search_frame": FRAME, "search_position": POSITION, "search_attitude": Unit(),
         "search_timeout": Limit(1e-3, 300.0, "s", optional=True), "inclination_hint": Limit(0.0, pi, "rad", optional=True),
@@ -236,19 +237,19 @@ LIMITS: dict[type, dict[str, Any]] = {
     PerchPlanRequest: {
         "start": STAMP, "p": POSITION, "v": VELOCITY, "a": ACCELERATION, "j": _vector(1e5, "m/s^3"), "yaw": Limit(-1e3, 1e3, "rad"),
         "yaw_rate": Limit(-100.0, 100.0, "rad/s"), "p_WS": POSITION, "q_WS": Unit(), "target_velocity": VELOCITY,
-        "waypoints": Limit(-1e4, 1e4, "m", (-1, 3), 50), "segment_times": Limit(0.01, PLAN_LONGEST, "s", (-1,), 51),
+        "waypoints": Limit(-1e4, 1e4, "m", (-1, 3), 50), "segment_times": Limit(0.01, PLAN_DURATION_MAX, "s", (-1,), 51),
         "impact_acceleration": Limit(0.0, 100.0, "m/s^2"), "impact_speed_min": Limit(0.0, 20.0, "m/s"),
         "impact_speed_max": Limit(0.0, 20.0, "m/s"), "thrust_max": Limit(0.01, 1e3, "N"), "thrust_min": Limit(0.0, 1e3, "N"),
         "thrust_ratio": Limit(0.0, 2.0, ""), "objective": Limit(0, 4)},
     PowerlinePlanRequest: {
-        "start": STAMP, "p": POSITION, "q": Unit(1e-2), "v": VELOCITY, "w": TURN_RATE, "rotor_thrust": Limit(0.0, 1e3, "N", (-1,), 4),
+        "start": STAMP, "p": POSITION, "q": Unit(1e-2), "v": VELOCITY, "w": ANGULAR_VELOCITY, "rotor_thrust": Limit(0.0, 1e3, "N", (-1,), 4),
         "lines": Each(MappedPowerline, PLAN_LINES_MAX), "target_line": ID, "perch_point": POSITION, "perch_pitch": Limit(0.0, pi + 1e-9, "rad"),
         "end_velocity": VELOCITY, "deadline": Limit(0.0, 1e12, "s")},
 }
 """Limits by type of value and field; fields that are None are not checked."""
 
 STATE = {name: LIMITS[PerchPlanRequest][name] for name in ("p", "v", "a", "j", "yaw", "yaw_rate")}
-CURRENT = {"durations": Limit(1e-3, PLAN_LONGEST, "s", (-1,), PLAN_SEGMENTS_MAX), "degree": Limit(0, DEGREE_MAX),
+CURRENT = {"durations": Limit(1e-3, PLAN_DURATION_MAX, "s", (-1,), PLAN_SEGMENTS_MAX), "degree": Limit(0, DEGREE_MAX),
            "coefficients": _coefficients(PLAN_SEGMENTS_MAX)}
 """Limits of `PerchPlanRequest.current`; its state at `start` must be within `STATE`."""
 POSE: dict[str, Limit | Unit] = {"position": POSITION, "orientation": Unit(1e-2)}
@@ -259,13 +260,13 @@ def problem(value: Any) -> str:
     """Return why a value is invalid, as `field: reason`; empty: valid, or no limits for its type. Runs at every IMU sample."""
     kind = type(value)
     try:
-        if kind in _QUICK and _QUICK[kind](value):
+        if kind in _FAST_CHECKS and _FAST_CHECKS[kind](value):
             return ""
     except (AttributeError, IndexError, TypeError, ValueError):  # of other sizes or kinds
         pass
     for name, limit in LIMITS.get(kind, {}).items():
-        if (entry := getattr(value, name)) is not None and (said := limit.problem(entry)):
-            return f"{name}{said}" if said[0] == "[" else f"{name}: {said}"
+        if (entry := getattr(value, name)) is not None and (reason := limit.problem(entry)):
+            return f"{name}{reason}" if reason[0] == "[" else f"{name}: {reason}"
     return ""
 
 
@@ -282,8 +283,8 @@ def check(source: str, values: Any, limits: dict[str, Any] | None = None) -> Non
     """
     for name, limit in (LIMITS[type(values)] if limits is None else limits).items():
         value = getattr(values, name)
-        if value is not None and (said := limit.problem(value)):
-            raise ConfigError(source, name, said) if said[0] != "[" else ConfigError(source, *f"{name}{said}".split(": ", 1))
+        if value is not None and (reason := limit.problem(value)):
+            raise ConfigError(source, name, reason) if reason[0] != "[" else ConfigError(source, *f"{name}{reason}".split(": ", 1))
 
 
 def stamp_of(request: Any) -> int:
@@ -316,5 +317,5 @@ def _variances(covariance: np.ndarray) -> bool:
     return len(entries) == 36 and hypot(*entries) < VARIANCE_MAX and min(entries[::7]) >= 0.0
 
 
-_QUICK: dict[type, Callable[[Any], bool]] = {ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motors}
+_FAST_CHECKS: dict[type, Callable[[Any], bool]] = {ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motors}
 """Fast checks, 1 to 2 us each, by type; where one does not accept a value, `LIMITS` decides."""

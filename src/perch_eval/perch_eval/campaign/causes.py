@@ -11,10 +11,10 @@ from perch_sim.scenario import Adhesion
 
 SUCCESS = "perched"
 MEANING = {
-    "not_found": "the target was not seen well enough in time", "refused": "the planner refused to plan",
-    "lost_track": "the controller or the estimator gave up before the contact", "missed_pad": "touched beside the pad, or nothing",
+    "not_found": "the target was not found well enough in time", "refused": "the planner refused to plan",
+    "lost_track": "control or estimation failed before the contact", "missed_pad": "touched beside the pad, or nothing",
     "too_fast": "arrived on the pad too fast, along or across it", "too_slow": "arrived on the pad too slowly to stick",
-    "tilt": "arrived on the pad too much tilted", "came_off": "the mission was satisfied, but the velcro did not hold",
+    "tilt": "arrived on the pad with too much tilt error", "came_off": "the mission reported success, but the velcro did not hold",
     "crash": "hit something hard, or with another part than the plate", "timeout": "did not come to an end in time",
     "error": "the flight could not be carried out",
 }
@@ -32,7 +32,7 @@ def cause_of(outcome: str, contacts: Sequence[Contact], adhesion: Adhesion) -> s
         adhesion: the limits of the velcro.
     """
     if outcome == "perched":
-        return SUCCESS if _holds(contacts) else "came_off"
+        return SUCCESS if _attached_at_end(contacts) else "came_off"
     if outcome == "inspected" and not any(c.state == ContactState.COLLISION for c in contacts):
         return SUCCESS
     touches = [c for c in contacts if c.state in (ContactState.BOUNCED, ContactState.COLLISION)]
@@ -43,10 +43,10 @@ def cause_of(outcome: str, contacts: Sequence[Contact], adhesion: Adhesion) -> s
     first = touches[0]
     if first.state == ContactState.COLLISION or first.body != "pad" and any("crashed" in c.reason for c in touches):
         return "crash"
-    return _bounce(first, adhesion)
+    return _bounce_cause(first, adhesion)
 
 
-def _bounce(touch: Contact, adhesion: Adhesion) -> str:
+def _bounce_cause(touch: Contact, adhesion: Adhesion) -> str:
     """Which limit of the velcro a touch missed by most."""
     if "outside the pad" in touch.reason:
         return "missed_pad"
@@ -57,7 +57,7 @@ def _bounce(touch: Contact, adhesion: Adhesion) -> str:
     return max(ratios, key=lambda name: ratios[name])
 
 
-def _holds(contacts: Sequence[Contact]) -> bool:
+def _attached_at_end(contacts: Sequence[Contact]) -> bool:
     holder = ""  # pad or cable
     for c in contacts:
         if c.state == ContactState.ATTACHED:

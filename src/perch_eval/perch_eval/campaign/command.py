@@ -11,8 +11,8 @@ from pathlib import Path
 
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.causes import MEANING, SUCCESS
-from perch_eval.campaign.engines import ENGINES, Task, carry_out, resolve
-from perch_eval.campaign.progress import counted
+from perch_eval.campaign.engines import ENGINES, Task, run_task, resolve
+from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.results import Results, RunResult, flight_folder, worst
 from perch_eval.campaign.specification import Campaign, load_campaign
 from perch_eval.campaign.workers import in_pool, on_cluster
@@ -24,8 +24,8 @@ EXAMPLES = """examples:
   python3 scripts/campaign.py contact --resume                  go on after an interruption
   python3 scripts/campaign.py contact --cluster tcp://host:8786 on a Dask cluster
 
-exit code: 0 every run was flown (whatever came of it), 1 some could not be carried out, 2 the caller's mistake,
-130 interrupted (results so far are kept; --resume goes on)"""
+exit code: 0 every run was flown (whatever came of it), 1 some could not be carried out, 2 invalid input,
+130 interrupted (results so far are kept; --resume continues)"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -36,12 +36,12 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--runs", type=count, metavar="N", help="flights, with grids per grid point (default: the file's)")
     out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes (default: %(default)s)")
     out.add_argument("--cluster", metavar="ADDRESS", help="Dask scheduler (SECURITY.md)")
-    out.add_argument("--resume", action="store_true", help="go on with the results in --out")
+    out.add_argument("--resume", action="store_true", help="continue with the results in --out")
     out.add_argument("--out", type=Path, metavar="DIR", help="folder of results and report (default: out/campaigns/<name>)")
     return out
 
 
-def _carry_out(args: argparse.Namespace) -> int:
+def _run_campaign(args: argparse.Namespace) -> int:
     campaign = load_campaign(args.campaign, args.engine, args.runs)
     resolve(campaign.engine)
     out = output_folder(args.out or Path("out") / "campaigns" / campaign.name)
@@ -55,7 +55,7 @@ def _carry_out(args: argparse.Namespace) -> int:
             keep_worst(campaign, found, out)
             report = write_report(campaign, found, out)
         except KeyboardInterrupt:
-            print(f"\ninterrupted: {len(results.all())} of {len(campaign.runs)} results are in {file}; go on with --resume", file=sys.stderr)
+            print(f"\ninterrupted: {len(results.all())} of {len(campaign.runs)} results are in {file}; continue with --resume", file=sys.stderr)
             return 130
     print(summary(found))
     print(f"results: {file}\nreport: {report}")
@@ -71,12 +71,12 @@ def fly_all(campaign: Campaign, results: Results, jobs: int, cluster: str | None
     """
     known = results.all()
     finished = {r.number for r in known}
-    tasks = [Task.of(campaign, run) for run in campaign.runs if run.number not in finished]
+    tasks = [Task.from_campaign(campaign, run) for run in campaign.runs if run.number not in finished]
     print(f"{campaign.name}: {len(tasks)} of {len(campaign.runs)} runs to fly on {campaign.engine}, "
           + (f"Dask {cluster}" if cluster else f"{jobs} process{'es' if jobs > 1 else ''}"), flush=True)
     flown = on_cluster(tasks, cluster) if cluster else in_pool(tasks, jobs)
     good = sum(r.cause == SUCCESS for r in known)
-    for result in counted(flown, len(campaign.runs), lambda r: r.cause == SUCCESS, already=len(finished), good_already=good):
+    for result in with_progress(flown, len(campaign.runs), lambda r: r.cause == SUCCESS, initial=len(finished), initial_good=good):
         results.add(result)
 
 
@@ -86,16 +86,16 @@ def keep_worst(campaign: Campaign, found: list[RunResult], out: Path) -> None:
     for result in worst(found, campaign.keep_worst):
         folder = out / flight_folder(result.number)
         if not (folder / "report.html").exists() and campaign.engine in ENGINES:
-            carry_out(Task.of(campaign, by_number[result.number], str(folder)))
+            run_task(Task.from_campaign(campaign, by_number[result.number], str(folder)))
 
 
 def summary(found: list[RunResult]) -> str:
     """Success and causes for the terminal, most frequent first."""
-    rate = Rate.of(r.cause == SUCCESS for r in found)
+    rate = Rate.from_outcomes(r.cause == SUCCESS for r in found)
     lines = [f"success: {rate}  (95 % Wilson)"]
     for cause, flights in Counter(r.cause for r in found if r.cause != SUCCESS).most_common():
         lines.append(f"  {flights:5d}  {cause:<11} {MEANING.get(cause, '')}")
     return "\n".join(lines)
 
 
-main = command(parser, _carry_out)
+main = command(parser, _run_campaign)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from perch_core.config import LARGEST_NUMBER
+from perch_core.config import FALLBACK_BOUND
 from perch_core.errors import ConfigError
 
 LARGEST_SEED = 2**31 - 1
@@ -64,10 +64,10 @@ def parse(source: str, key: str, entry: Any) -> Distribution:
     if not isinstance(values, list) or not values:
         raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not a list")
     if len({_sort(v) for v in values}) > 1 or "" in map(_sort, values):
-        raise ConfigError(source, f"{key}.{kind}", f"{values!r} are not all numbers (of at most {LARGEST_NUMBER:g}), words, true or false, or vectors")
+        raise ConfigError(source, f"{key}.{kind}", f"{values!r} are not all numbers (of at most {FALLBACK_BOUND:g}), words, true or false, or vectors")
     if kind in ("uniform", "normal"):
         if len(values) != 2 or not all(_is_number(v) for v in values):
-            raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not two numbers of at most {LARGEST_NUMBER:g}")
+            raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not two numbers of at most {FALLBACK_BOUND:g}")
         if kind == "uniform" and not values[0] < values[1]:
             raise ConfigError(source, f"{key}.uniform", f"{values[0]} is not below {values[1]}")
         if kind == "normal" and not values[1] > 0:
@@ -75,7 +75,7 @@ def parse(source: str, key: str, entry: Any) -> Distribution:
     limits = {name: entry[name] for name in ("low", "high") if name in entry}
     for name, value in limits.items():
         if not _is_number(value):
-            raise ConfigError(source, f"{key}.{name}", f"{value!r} is not a number of at most {LARGEST_NUMBER:g}")
+            raise ConfigError(source, f"{key}.{name}", f"{value!r} is not a number of at most {FALLBACK_BOUND:g}")
     return Distribution(kind, tuple(tuple(v) if isinstance(v, list) else v for v in values), **limits)
 
 
@@ -99,4 +99,4 @@ def _sort(value: Any) -> str:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= FALLBACK_BOUND

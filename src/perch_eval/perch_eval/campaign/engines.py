@@ -16,7 +16,7 @@ import yaml
 
 from perch_core import config
 from perch_core.errors import PerchError
-from perch_core.processes import one_thread_for_sums
+from perch_core.processes import single_threaded_blas
 from perch_core.registry import resolved
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.campaign.causes import cause_of
@@ -37,17 +37,17 @@ class Task:
         scenario: the scenario's mapping.
         engine: name.
         sensing: which cameras the in-process engine renders.
-        keep: folder for the flight's full report; empty: none is kept.
+        report_folder: of the flight's full report; empty: none is written.
     """
 
     run: Run
     scenario: dict[str, Any]
     engine: str
     sensing: Sensing
-    keep: str = ""
+    report_folder: str = ""
 
     @classmethod
-    def of(cls, campaign: Campaign, run: Run, keep: str = "") -> Task:
+    def from_campaign(cls, campaign: Campaign, run: Run, report_folder: str = "") -> Task:
         """A run of a campaign."""
         return cls(run, campaign.mapping(run), campaign.engine, campaign.sensing, keep)
 
@@ -66,14 +66,14 @@ def resolve(name: str) -> Callable[[Task], RunResult]:
         raise PerchError(f"engine {name!r}: {error}") from None
 
 
-def carry_out(task: Task) -> RunResult:
+def run_task(task: Task) -> RunResult:
     """Fly one run; whatever goes wrong is a result as well."""
     began = time.perf_counter()
-    one_thread_for_sums()
+    single_threaded_blas()
     cv2.setNumThreads(1)  # runs share the cores already; OpenCV's own threads cost each of them 15 % more CPU time
     try:
         result = resolve(task.engine)(task)
-    except Exception as error:  # one run that breaks must not end the campaign; its words are in the results
+    except Exception as error:  # one run that breaks must not end the campaign; its message is in the results
         result = RunResult(task.run.number, task.run.seed, "error", "failed", f"{type(error).__name__}: {error}")
     return dataclasses.replace(result, values=task.run.values, wall_time=time.perf_counter() - began)
 
@@ -90,14 +90,14 @@ def fly_in_process(task: Task, measure: Measure = lambda *_: {}, linger: float =
         linger: flown on after its end [s].
     """
     scenario = config.from_mapping(Scenario, task.scenario, f"run {task.run.number}")
-    trace = fly(scenario, task.run.seed, task.sensing, 0.5 if task.keep else linger)
+    trace = fly(scenario, task.run.seed, task.sensing, 0.5 if task.report_folder else linger)
     vehicle = load_vehicle(scenario.vehicle)
     metrics = figures(flight_metrics(trace.flight, trace.end_time), trace.end_time)
-    if task.keep:
-        from perch_eval.report import build_report  # and with it matplotlib and ROS: most workers keep no flight
+    if task.report_folder:
+        from perch_eval.report import build_report  # and with it matplotlib and ROS: most workers write no report
         from perch_eval.ros.recorded_flight import write
 
-        folder = Path(task.keep)
+        folder = Path(task.report_folder)
         folder.mkdir(parents=True, exist_ok=True)
         write(folder / "flight.mcap", trace.timeline())
         (folder / "scenario.yaml").write_text(yaml.safe_dump(task.scenario))
@@ -113,7 +113,7 @@ def fly_on_the_stack(task: Task) -> RunResult:
     from perch_eval.ros.recorded_flight import RecordedFlight
 
     with contextlib.ExitStack() as stack:
-        folder = Path(task.keep or stack.enter_context(tempfile.TemporaryDirectory(prefix="perch-run-")))
+        folder = Path(task.report_folder or stack.enter_context(tempfile.TemporaryDirectory(prefix="perch-run-")))
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / "scenario.yaml"
         file.write_text(yaml.safe_dump(task.scenario))

@@ -13,7 +13,7 @@ from perch_eval.campaign.results import RunResult
 from perch_eval.statistics import Rate
 
 BINS = 6
-GOOD, BAD = "#2b8a3e", "#c92a2a"
+SUCCESS_COLOR, FAILURE_COLOR = "#2b8a3e", "#c92a2a"
 
 
 class Axis:
@@ -69,13 +69,13 @@ def success_curve(found: Sequence[RunResult], name: str) -> Figure:
     """Success rate over one varied quantity with 95 % Wilson intervals."""
     axis = Axis([r.values[name] for r in found])
     cells = [[r for r in found if axis.cell(r.values[name]) == k] for k in range(len(axis.labels))]
-    rates = [Rate.of(r.cause == SUCCESS for r in cell) for cell in cells]
+    rates = [Rate.from_outcomes(r.cause == SUCCESS for r in cell) for cell in cells]
     figure = Figure(figsize=(max(4.0, 0.9 * len(cells) + 1.0), 2.6), layout="constrained")
     axes = figure.subplots()
     value = np.array([r.value for r in rates])
     low, high = np.array([r.interval for r in rates]).T
     axes.errorbar(range(len(cells)), value, [np.clip(value - low, 0, None), np.clip(high - value, 0, None)], fmt="o-",
-                  color=GOOD, capsize=4)
+                  color=SUCCESS_COLOR, capsize=4)
     axes.set_xticks(range(len(cells)), [f"{label}\nn={r.trials}" for label, r in zip(axis.labels, rates)], fontsize=8)
     axes.set(ylim=(-0.03, 1.03), xlabel=name, ylabel="success rate")
     axes.grid(alpha=0.3)
@@ -102,7 +102,7 @@ def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]
             continue
         top = float(np.percentile(everything, 99)) or 1.0
         edges = np.linspace(min(0.0, min(everything)), max(top, 1e-9), 25)
-        axes.hist([np.minimum(group, edges[-1]) for group in groups], bins=edges, stacked=True, color=[GOOD, BAD],
+        axes.hist([np.minimum(group, edges[-1]) for group in groups], bins=edges, stacked=True, color=[SUCCESS_COLOR, FAILURE_COLOR],
                   label=["perched", "failed"])
         axes.axvline(float(np.median(everything)), color="k", lw=0.8, ls="--", label="median")
         axes.yaxis.get_major_locator().set_params(integer=True)

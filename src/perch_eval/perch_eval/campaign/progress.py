@@ -12,21 +12,21 @@ T = TypeVar("T")
 
 
 class Progress:
-    """One line that is rewritten on a terminal; elsewhere a line every few seconds. Without a total it says how many there have been."""
+    """One line that is rewritten on a terminal; elsewhere a line every few seconds. Without a total it only counts."""
 
-    def __init__(self, total: int | None, already: int = 0, good_already: int = 0, what: str = "runs", out: TextIO | None = None,
+    def __init__(self, total: int | None, initial: int = 0, initial_good: int = 0, unit: str = "runs", out: TextIO | None = None,
                  period: float = 10.0) -> None:
-        self._total, self._done, self._good, self._already = total, already, good_already, already
-        self._what, self._out, self._judged = what, out or sys.stderr, already > 0
+        self._total, self._done, self._good, self._initial = total, initial, initial_good, initial
+        self._unit, self._out, self._rated = unit, out or sys.stderr, initial > 0
         self._terminal = self._out.isatty()
         self._period = 0.1 if self._terminal else period
         self._began = self._shown = time.monotonic()
 
     def add(self, good: bool | None = None) -> None:
-        """One more is finished; None: nobody judges it."""
+        """One more is finished; None: neither good nor bad."""
         self._done += 1
         self._good += bool(good)
-        self._judged |= good is not None
+        self._rated |= good is not None
         now = time.monotonic()
         if now - self._shown >= self._period or self._done == self._total:
             self._shown = now
@@ -35,33 +35,33 @@ class Progress:
 
     def line(self, now: float) -> str:
         """The line at a time of the monotonic clock."""
-        fresh, elapsed = self._done - self._already, max(now - self._began, 1e-9)
+        fresh, elapsed = self._done - self._initial, max(now - self._began, 1e-9)
         rate = fresh / elapsed
-        text = f"  {self._done}" + ("" if self._total is None else f"/{self._total}") + f" {self._what}"
-        if self._done and self._judged:
+        text = f"  {self._done}" + ("" if self._total is None else f"/{self._total}") + f" {self._unit}"
+        if self._done and self._rated:
             text += f", {self._good} good ({100 * self._good / self._done:.0f} %)"
         if fresh:
             text += f", {60 * rate:.1f} per minute"
             if self._total is not None and self._done < self._total:
-                text += f", {span((self._total - self._done) / rate)} left"
+                text += f", {duration_text((self._total - self._done) / rate)} left"
         return text
 
     def close(self) -> None:
         """End the line."""
-        if self._terminal and self._done > self._already:
+        if self._terminal and self._done > self._initial:
             self._out.write("\n")
 
 
-def counted(found: Iterable[T], total: int, good: Callable[[T], bool | None] = lambda _: None, **options: Any) -> Iterator[T]:
-    """What is found, counted on its way; further options are those of `Progress`."""
+def with_progress(found: Iterable[T], total: int, good: Callable[[T], bool | None] = lambda _: None, **options: Any) -> Iterator[T]:
+    """The items of `found`, with a `Progress` line; further options are those of `Progress`."""
     with closing(Progress(total, **options)) as progress:
         for one in found:
             yield one
             progress.add(good(one))
 
 
-def span(seconds: float) -> str:
-    """A duration in words."""
+def duration_text(seconds: float) -> str:
+    """A duration as text."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -28,7 +28,7 @@ def write_report(campaign: Campaign, found: Sequence[RunResult], folder: Path) -
 
 
 def _page(campaign: Campaign, found: Sequence[RunResult], folder: Path) -> str:
-    rate = Rate.of(r.cause == SUCCESS for r in found)
+    rate = Rate.from_outcomes(r.cause == SUCCESS for r in found)
     varied = [name for name in campaign.vary if name != "seed"]
     complete = [r for r in found if all(name in r.values for name in varied)]
     parts = [f"<p>{text(campaign.description)}</p>", _facts(campaign, found, rate), _causes(found, folder)]
@@ -68,7 +68,7 @@ def _causes(found: Sequence[RunResult], folder: Path) -> str:
 
 def _spreads(found: Sequence[RunResult], present: dict[str, tuple[str, float]]) -> str:
     perched = [r for r in found if r.cause == SUCCESS]
-    return table(((title, *(Spread.of(r.metrics.get(name) for r in some).words(factor, 2) for some in (found, perched)))
+    return table(((title, *(Spread.from_values(r.metrics.get(name) for r in some).to_text(factor, 2) for some in (found, perched)))
                   for name, (title, factor) in present.items()), ("median [range]", "all flights", "perched"))
 
 

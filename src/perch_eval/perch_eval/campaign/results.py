@@ -38,18 +38,18 @@ class Results:
         Args:
             path: of the file.
             name, digest: of the campaign.
-            resume: go on where an earlier campaign ended.
+            resume: continue where an earlier campaign ended.
 
         Raises:
             ResultsError: it holds another campaign's results, or results and `resume` is not asked for, or it is damaged.
         """
-        whose, found = read_results(path)
-        if whose and whose.get("digest") != digest:
-            raise ResultsError(f"{path} holds results of campaign {whose.get('name')!r} with other settings: "
-                               "choose another --out, or the settings of then")
+        header, found = read_results(path)
+        if header and header.get("digest") != digest:
+            raise ResultsError(f"{path} holds results of campaign {header.get('name')!r} with other settings: "
+                               "choose another --out, or the original settings")
         if found and not resume:
-            raise ResultsError(f"{path} already holds {len(found)} results: --resume goes on with them, another --out starts anew")
-        self._found = {result.number: result for result in found}
+            raise ResultsError(f"{path} already holds {len(found)} results: --resume continues with them, another --out starts a new campaign")
+        self._results = {result.number: result for result in found}
         try:
             self._rows = Rows(path, [{"name": name, "digest": digest}, *map(asdict, found)])
         except OSError as error:
@@ -57,13 +57,13 @@ class Results:
 
     def add(self, result: RunResult) -> None:
         """Write one row; a run that is there already is left as it is."""
-        if result.number not in self._found:
+        if result.number not in self._results:
             self._rows.add(asdict(result))
-            self._found[result.number] = result
+            self._results[result.number] = result
 
     def all(self) -> list[RunResult]:
         """Every result, by number."""
-        return [self._found[number] for number in sorted(self._found)]
+        return [self._results[number] for number in sorted(self._results)]
 
     def close(self) -> None:
         """Close the file."""
@@ -77,8 +77,8 @@ def read_results(path: Path) -> tuple[dict[str, Any], list[RunResult]]:
         ResultsError: it cannot be read.
     """
     try:
-        whose, *rows = [*rows_of(path)] or [{}]
-        return dict(whose), sorted((_result(**row) for row in rows), key=lambda result: result.number)
+        header, *rows = [*rows_of(path)] or [{}]
+        return dict(header), sorted((_result(**row) for row in rows), key=lambda result: result.number)
     except (OSError, ValueError, TypeError, RecursionError) as error:  # of the file, of JSON in it, of its rows, of JSON's depth
         raise _unreadable(path, error) from None
 

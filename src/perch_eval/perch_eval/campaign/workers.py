@@ -14,27 +14,27 @@ from typing import TypeVar
 
 from perch_core.errors import PerchError
 from perch_core.processes import end_with_parent, without_interrupts
-from perch_eval.campaign.engines import Task, carry_out
+from perch_eval.campaign.engines import Task, run_task
 from perch_eval.campaign.results import RunResult
 from perch_eval.extras import require
 
 T = TypeVar("T")
 R = TypeVar("R")
-END_LIMIT = 5  # of a worker that is told to end [s]
+TERMINATION_TIMEOUT = 5  # of a worker after SIGTERM [s]
 ATTEMPTS = 3  # a run whose worker died so often is given up
 
 
-def _end(*_: object) -> None:
+def _on_terminate(*_: object) -> None:
     """An exception, so that nodes are stopped on the way out; the pool takes one out of a run for its result, so there is a limit."""
-    signal.alarm(END_LIMIT)
+    signal.alarm(TERMINATION_TIMEOUT)
     sys.exit(1)
 
 
 def prepare_worker() -> None:
-    """Ctrl-C is the campaign's own matter, and no worker outlives its campaign."""
+    """Leave Ctrl-C to the campaign, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # what the worker starts has signals of its own
-    signal.signal(signal.SIGTERM, _end)
+    signal.signal(signal.SIGTERM, _on_terminate)
     end_with_parent(signal.SIGTERM)
     campaign = multiprocessing.parent_process()
     if campaign is not None and os.getppid() != campaign.pid:  # it has ended while this worker was starting
@@ -42,14 +42,14 @@ def prepare_worker() -> None:
 
 
 def _call(work: Callable[[T], R], item: T) -> R:
-    """Told to stop in the middle of its work, the pool would take that for the work's own end, and wait for ever for another."""
+    """Without it the pool would take a termination for the end of the work, and wait for ever for another."""
     try:
         return work(item)
     except SystemExit:
         os._exit(1)
 
 
-def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int | None = None, dead: Callable[[T], R] | None = None
+def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int | None = None, on_worker_death: Callable[[T], R] | None = None
                  ) -> Iterator[tuple[T, R]]:
     """Results of work in processes, as they are finished.
 
@@ -60,36 +60,36 @@ def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int | None = 
         work: to be done, a function of a module.
         items: its arguments.
         jobs: processes; None: one on each core.
-        dead: result of an item whose worker died `ATTEMPTS` times.
+        on_worker_death: gives the result of an item whose worker died `ATTEMPTS` times.
 
     Raises:
-        PerchError: a worker died so often, and there is no `dead`.
+        PerchError: a worker died so often, and there is no `on_worker_death`.
     """
     jobs = jobs or os.cpu_count() or 1
     waiting, attempts = deque(enumerate(items)), Counter[int]()
     while waiting:
         pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker)
-        under_way: dict[Future[R], tuple[int, T]] = {}
+        pending: dict[Future[R], tuple[int, T]] = {}
         try:
-            while waiting or under_way:
-                while waiting and len(under_way) < 2 * jobs:
+            while waiting or pending:
+                while waiting and len(pending) < 2 * jobs:
                     with without_interrupts():  # a worker that has just been started would print where it was
-                        under_way[pool.submit(_call, work, waiting[0][1])] = waiting[0]  # raises where the pool has broken: it goes on waiting
+                        pending[pool.submit(_call, work, waiting[0][1])] = waiting[0]  # raises where the pool has broken: it goes on waiting
                     waiting.popleft()
-                for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                for future in wait(pending, return_when=FIRST_COMPLETED).done:
                     result = future.result()
-                    yield under_way.pop(future)[1], result
+                    yield pending.pop(future)[1], result
         except BrokenProcessPool:
-            for future, (number, item) in under_way.items():
+            for future, (number, item) in pending.items():
                 attempts[number] += 1
                 if future.done() and future.exception() is None:
                     yield item, future.result()
                 elif attempts[number] < ATTEMPTS:
                     waiting.append((number, item))
-                elif dead is None:
+                elif on_worker_death is None:
                     raise PerchError(f"a process has died {ATTEMPTS} times at {item}") from None
                 else:
-                    yield item, dead(item)
+                    yield item, on_worker_death(item)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():  # in the middle of what they do
@@ -98,14 +98,14 @@ def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int | None = 
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def dead(task: Task, why: str = f"its worker died {ATTEMPTS} times") -> RunResult:
+def failed_run(task: Task, message: str = f"its worker died {ATTEMPTS} times") -> RunResult:
     """The result of a run whose workers died."""
-    return RunResult(task.run.number, task.run.seed, "error", "failed", why, task.run.values)
+    return RunResult(task.run.number, task.run.seed, "error", "failed", message, task.run.values)
 
 
 def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
     """Carry out runs of a campaign in `jobs` processes; results come as they are finished."""
-    for _, result in in_processes(carry_out, tasks, jobs, dead):
+    for _, result in in_processes(run_task, tasks, jobs, failed_run):
         yield result
 
 
@@ -127,13 +127,13 @@ def on_cluster(tasks: Sequence[Task], address: str) -> Iterator[RunResult]:
     except (OSError, TimeoutError, ValueError) as error:
         raise PerchError(f"--cluster {address}: {error or 'no answer from the scheduler'}") from None
     with client:
-        futures = {client.submit(carry_out, task, key=f"run-{task.run.number}-{id(tasks):x}", pure=False, retries=ATTEMPTS):
+        futures = {client.submit(run_task, task, key=f"run-{task.run.number}-{id(tasks):x}", pure=False, retries=ATTEMPTS):
                    task for task in tasks}
         for future in as_completed(list(futures)):
             task = futures.pop(future)
             try:
                 result = future.result()  # may be lost with its worker even now: Dask then carries it out again
             except Exception as error:
-                result = dead(task, f"{type(error).__name__}: {error}")
+                result = failed_run(task, f"{type(error).__name__}: {error}")
             future.release()
             yield result

@@ -40,19 +40,19 @@ def fly(controller: str, condition: str, maneuver: str, seed: int) -> tuple[np.n
     flight.run(flight.time + 0.2)
     mission, height = flight.mission, flight.scenario.mission.takeoff_height
     place = mission.p_WB + (0.0, 0.0, height)
-    mission.go(np.array([0.0, 0.0, height]), height / TAKE_OFF_SPEED)
+    mission.move(np.array([0.0, 0.0, height]), height / TAKE_OFF_SPEED)
     flight.run(flight.time + LEAD + height / TAKE_OFF_SPEED + SETTLE)
     begin = flight.time
     order: int | None
     if maneuver == "line":
-        order = mission.go(LINE, LINE_TIME)
+        order = mission.move(LINE, LINE_TIME)
         end = begin + LEAD + LINE_TIME
         flight.run(end + HOVER)
     else:
         order = flight.perch(place)
         end = mission.contact_due
         flight.run(min(end, flight.time + 10.0) + 1.0)
-    if not flight.flew(order):
+    if not flight.accepted(order):
         return np.full(3, np.nan), f"not begun: {flight.events[-1][2]}"
     flown = flight.loop.trace.flight
     # A vehicle that has touched the wall follows no reference.

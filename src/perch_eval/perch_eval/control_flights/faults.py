@@ -14,7 +14,7 @@ import numpy as np
 
 from perch_control.modes import Command, State
 from perch_core.errors import PerchError
-from perch_core.values import Ask, OdometryState, seconds
+from perch_core.values import OdometryState, TriggerRequest, seconds
 from perch_eval.control_flights.way_out import Search, search
 from perch_eval.metrics import tilt_degrees
 from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight, scenario_of
@@ -54,7 +54,7 @@ def _stale(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     if rng.random() < 0.5:
         flight.loop.filters["controller", "odometry"] = lambda now, state: None
         return "no odometry any more"
-    last = flight.mission.believed
+    last = flight.mission.latest_odometry
     flight.loop.filters["controller", "odometry"] = lambda now, state: last
     return "the last sample again and again"
 
@@ -123,7 +123,7 @@ def _nothing(flight: ScriptedFlight, rng: np.random.Generator) -> str:
 def _abort(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     _lose_orders(flight)
     if rng.random() < 0.5:
-        flight.loop.request("controller", "abort", Ask())
+        flight.loop.request("controller", "abort", TriggerRequest())
         return "abort"
     flight.mission.order(Command.HOVER, "the goal was cancelled")
     return "cancel: hover"
@@ -191,7 +191,7 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
         with contextlib.suppress(PerchError):  # there is no plan from where the vehicle believes to be: the mission gives up, it hovers
             flight.perch(place)
 
-    script = [(begin, lambda: flight.mission.go(np.array([0.0, 0.0, height]), rise)), (ready, perch)]
+    script = [(begin, lambda: flight.mission.move(np.array([0.0, 0.0, height]), rise)), (ready, perch)]
     struck, done, phase, before, first = False, "", "", (0.0,) * 4, 0
     resting = flight.time
     while flight.time < moment + LIMIT and not flight.simulation.plant.crashed:

@@ -12,12 +12,12 @@ import numpy as np
 
 from perch_eval import consistency
 from perch_eval import estimation_flight as flights
-from perch_eval.campaign.progress import counted
+from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.consistency import Consistency
 from perch_eval.estimation_flight import EstimatorTrack
 from perch_eval.evaluation.sections import Effort, Section
-from perch_eval.target_sightings import Sightings, see_target
+from perch_eval.target_sightings import Sightings, localize_target
 from perch_sim.scenario import load_scenario
 
 SCENARIO = "surface_90"
@@ -48,7 +48,7 @@ def consistency_sections(effort: Effort) -> list[Section]:
                   "is the same in every run, VIO's start parameters wrong as declared (1 mm, 1 mrad). NEES per dimension, averaged over the flight; the "
                   "share of the time in which the mean over the runs is inside its 95 % bounds, and above them (too sure).")
     motion = flights.motion_of(load_scenario(SCENARIO), effort.seeds.start)  # its phases are those of every run
-    found = dict(counted(in_processes(_fly, list(effort.seeds), effort.jobs), len(effort.seeds), what="perches"))
+    found = dict(with_progress(in_processes(_fly, list(effort.seeds), effort.jobs), len(effort.seeds), unit="perches"))
     flown = [found[seed] for seed in effort.seeds]
     n = min(len(one.track.times) for one in flown)
     results = _judged(GROUPS, flown[0].track.times[:n], [one.track.errors[:n] for one in flown], [one.track.covariances[:n] for one in flown])
@@ -85,7 +85,7 @@ def _fly(seed: int) -> _Run:
     nees = [consistency.nees(s.error[:6], s.result.estimate.pose_covariance) for s in posed if s.error is not None and s.result.estimate is not None]
     return _Run(track, np.array([s.time for s in posed]), np.array(nees),
                 sum(s.result.nis for s in seen) / sum(s.result.nis_dimension for s in seen),
-                see_target(scenario, flight, track, seed, motion.perch_time + LOOK[0], motion.perch_time + LOOK[1]))
+                localize_target(scenario, flight, track, seed, motion.perch_time + LOOK[0], motion.perch_time + LOOK[1]))
 
 
 def _judged(groups: dict[str, slice], times: np.ndarray, errors: list[np.ndarray], covariances: list[np.ndarray]) -> list[Consistency]:

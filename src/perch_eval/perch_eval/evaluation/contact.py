@@ -11,7 +11,7 @@ from perch_eval.campaign.engines import Task
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import load_campaign
 from perch_eval.evaluation.document import table, write_page
-from perch_eval.evaluation.kept import flown
+from perch_eval.evaluation.kept import cached_runs
 from perch_eval.evaluation.perching import perches
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.metrics import FIGURES
@@ -34,7 +34,7 @@ def contact_sections(effort: Effort) -> list[Section]:
     data = {"papers": [asdict(r) for flights in groups.values() for r in flights]}
     for name in CAMPAIGNS:
         campaign = load_campaign(name)
-        found = flown(effort, name, [Task.of(campaign, run) for run in campaign.runs])
+        found = cached_runs(effort, name, [Task.from_campaign(campaign, run) for run in campaign.runs])
         data[name], groups = [asdict(r) for r in found], {}
         for r in found:
             groups.setdefault(", ".join(f"{key.rpartition('.')[2]} {value:g}" for key, value in r.values.items()), []).append(r)
@@ -48,12 +48,13 @@ def contact_sections(effort: Effort) -> list[Section]:
 def _table(groups: dict[str, list[RunResult]]) -> list[str]:
     head = " | ".join(("condition", "perched", "others", *(f"{FIGURES[name][0]} [{FIGURES[name][1]}]" for name in COLUMNS)))
     return table(head, ((condition, f"{_rate(flights).successes} of {len(flights)}", _others(flights), *(
-        Spread.of(r.metrics.get(name) for r in flights if r.cause == SUCCESS).words(FIGURES[name][2], digits) for name, digits in COLUMNS.items()))
+        Spread.from_values(r.metrics.get(name) for r in flights if r.cause == SUCCESS).to_text(FIGURES[name][2], digits)
+        for name, digits in COLUMNS.items()))
         for condition, flights in groups.items()))
 
 
 def _rate(flights: Sequence[RunResult]) -> Rate:
-    return Rate.of(r.cause == SUCCESS for r in flights)
+    return Rate.from_outcomes(r.cause == SUCCESS for r in flights)
 
 
 def _others(flights: Sequence[RunResult]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from perch_eval.control_flights.comparison import CONDITIONS, CONTROLLERS, LINE, LINE_TIME, MANEUVERS, fly
 from perch_eval.control_flights.faults import END_STATES, FAULTS, fly_fault
 from perch_eval.evaluation.document import table, write_page
-from perch_eval.evaluation.kept import computed
+from perch_eval.evaluation.kept import cached_figures
 from perch_eval.evaluation.sections import Effort, Section
 
 MOMENTS = 20                         # of each fault
@@ -30,7 +30,7 @@ ENDINGS = ("hovering", "landed", "perched", "crashed", "lost")
 def fault_sections(effort: Effort) -> list[Section]:
     """Every fault at random moments; writes `faults_in_flight.md` and its JSON."""
     jobs = [(fault.name, seed) for fault in FAULTS for seed in range(1, MOMENTS + 1)]
-    flown = computed(effort, "faults", jobs, _faulted, lambda r: r["end"] in END_STATES)
+    flown = cached_figures(effort, "faults", jobs, _faulted, lambda r: r["end"] in END_STATES)
     about = (f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
              "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth.")
     out = Section("c_faults", "Faults in flight", f"{about} Flights without a good end: faults_in_flight.md.")
@@ -58,7 +58,7 @@ def comparison_sections(effort: Effort) -> list[Section]:
     """All controllers on the same flights; writes `comparison.md` and `comparison.json`."""
     seeds = range(1, 1 + (FULL_SEEDS if effort.full else QUICK_SEEDS))
     jobs = [(c, k, m, seed) for seed in seeds for m in MANEUVERS for k in CONDITIONS for c in CONTROLLERS]
-    flown = computed(effort, "comparison", jobs, _compared, lambda r: r["outcome"] in GOOD)
+    flown = cached_figures(effort, "comparison", jobs, _compared, lambda r: r["outcome"] in GOOD)
     runs = {key: [r for r in flown if (r["controller"], r["condition"], r["maneuver"]) == key] for key in product(CONTROLLERS, CONDITIONS, MANEUVERS)}
     offset = ", ".join(f"{x:g}" for x in LINE)
     about = (f"{'Seed 1' if len(seeds) == 1 else f'Seeds 1 to {len(seeds)}'}; true position against the reference "

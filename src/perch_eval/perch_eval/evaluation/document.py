@@ -10,14 +10,14 @@ from typing import Any
 
 from perch_core.json_values import write_json
 from perch_eval.evaluation.sections import BETTER, FAILS, HOLDS, MISSING, VACUOUS, WORSE, Effort, Section
-from perch_eval.revision import banner, commit, digest, made_of
+from perch_eval.revision import banner, commit, digest, code_version
 
 _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: "*not available*"}
 
 
 def write(sections: Sequence[Section], effort: Effort, duration: float) -> None:
     """Write `README.md` and `results.json` into the folder of the figures."""
-    content = {**made_of(), "command": effort.command, "duration_s": duration, "machine": machine(), "sections": [
+    content = {**code_version(), "command": effort.command, "duration_s": duration, "machine": machine(), "sections": [
         {"key": s.key, "title": s.title, "about": s.about, "rows": [row.__dict__ for row in s.rows],
          "figures": [name for name, _ in s.figures], "data": s.data} for s in sections]}
     write_page(effort, "README", _page(sections, duration), content, "results")
@@ -27,7 +27,7 @@ def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, A
     """A page among the results, with commit, command and machine below its heading, and its figures as JSON with the same; `data`: another name of these."""
     made_by = [banner([commit()], [digest()]), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
     (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by, *lines[1:]]) + "\n")
-    write_json(effort.out / f"{data or name}.json", {**made_of(), "command": effort.command, "machine": machine(), **content})
+    write_json(effort.out / f"{data or name}.json", {**code_version(), "command": effort.command, "machine": machine(), **content})
 
 
 def counts(sections: Sequence[Section]) -> Counter[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perch_eval.evaluation.kept import computed
+from perch_eval.evaluation.kept import cached_figures
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.modelled_sight import MAP_ERROR
 from perch_eval.inspection.figures import metrics_figure, paths_figure
@@ -58,7 +58,7 @@ def inspected(seed: int) -> dict[str, float]:
 
 def _layouts(effort: Effort) -> Section:
     count = effort.layouts
-    found = computed(effort, "inspections", range(1, count + 1), inspected, lambda r: r["collisions"] == 0)
+    found = cached_figures(effort, "inspections", range(1, count + 1), inspected, lambda r: r["collisions"] == 0)
     out = Section("p_inspection_layouts", "[P:VI-A] Inspection over random layouts",
                   f"{count} random layouts (seeds 1 to {count}) of three cables and six waypoints, in each of which the reference collides "
                   "twice; cores and error models as above. Without the line terms the same controller follows the reference.")
@@ -67,11 +67,12 @@ def _layouts(effort: Effort) -> Section:
     out.claim("collisions", f"{collisions} in {count} layouts, {ended} flown to the end", "none in more than 20 experiments",
               collisions == 0 and ended == count and twice == count, f"0; the reference collides twice in {twice} of {count}")
     out.show("layouts in which the flight without the line terms hits a cable", f"{sum(r['collisions_without'] > 0 for r in found)} of {count}")
-    gains = Spread.of(r["reference_px"] / r["flown_px"] for r in found)
+    gains = Spread.from_values(r["reference_px"] / r["flown_px"] for r in found)
     means = [float(np.mean([r[key] for r in found])) for key in ("reference_px", "flown_px")]
     out.claim("mean reprojection error", f"{means[0]:.0f} -> {means[1]:.1f} px, {means[0] / means[1]:.1f} times less", "500 % better, about 100 px",
-              means[0] / means[1] >= GAIN, f"cut by >= {GAIN:g} times; single layouts: {gains.words(1.0, 1, 'times')}")
-    out.show("least scaled clearance", Spread.of(r["clearance"] for r in found).words(1.0, 2, ""), "", "0 is contact, 1 is another body radius away")
+              means[0] / means[1] >= GAIN, f"cut by >= {GAIN:g} times; single layouts: {gains.to_text(1.0, 1, 'times')}")
+    out.show("least scaled clearance", Spread.from_values(r["clearance"] for r in found).to_text(1.0, 2, ""), "",
+             "0 is contact, 1 is another body radius away")
     out.show("line in front (14h), nearest point on the segment (14i)", f"{100 * min(r['cheirality'] for r in found):.1f} %, "
              f"{100 * min(r['segment'] for r in found):.1f} % of the time in the worst layout", "always, but for brief instants")
     out.data = {"layouts": found}

@@ -9,10 +9,10 @@ from typing import Any, TypeVar
 
 from perch_core.json_values import finite
 from perch_eval.campaign.causes import SUCCESS
-from perch_eval.campaign.engines import Task, carry_out
-from perch_eval.campaign.progress import counted
+from perch_eval.campaign.engines import Task, run_task
+from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.results import RunResult
-from perch_eval.campaign.workers import dead, in_processes
+from perch_eval.campaign.workers import failed_run, in_processes
 from perch_eval.evaluation.sections import Effort
 from perch_eval.revision import digest
 from perch_eval.rows import Rows, rows_of
@@ -20,8 +20,8 @@ from perch_eval.rows import Rows, rows_of
 T = TypeVar("T")
 
 
-def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], dict[str, Any]], good: Callable[[dict[str, Any]], bool],
-             key: Callable[[T], str] = str, dead: Callable[[T], dict[str, Any]] | None = None) -> list[dict[str, Any]]:
+def cached_figures(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], dict[str, Any]], good: Callable[[dict[str, Any]], bool],
+             key: Callable[[T], str] = str, on_worker_death: Callable[[T], dict[str, Any]] | None = None) -> list[dict[str, Any]]:
     """Figures of flights, a mapping each, in the order of the jobs.
 
     Args:
@@ -31,18 +31,18 @@ def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], d
         work: flies one job, in a process of its own.
         good: what is counted as good on the way.
         key: of a job in the file.
-        dead: figures of a job at which processes die again and again.
+        on_worker_death: gives the figures of a job at which processes die again and again.
 
     Raises:
-        PerchError: processes die at a job, and there is no `dead`.
+        PerchError: processes die at a job, and there is no `on_worker_death`.
     """
     effort.state.mkdir(parents=True, exist_ok=True)
     file = effort.state / f"{name}_{digest()}.jsonl"
     known: dict[str, dict[str, Any]] = {} if effort.fresh else dict(rows_of(file))
     missing = [job for job in jobs if key(job) not in known]
     before = [known[key(job)] for job in jobs if key(job) in known]
-    found = counted(in_processes(work, missing, effort.jobs, dead), len(jobs), lambda one: good(one[1]), already=len(before),
-                    good_already=sum(map(good, before)), what=name.replace("_", " "))
+    found = with_progress(in_processes(work, missing, effort.jobs, on_worker_death), len(jobs), lambda one: good(one[1]), initial=len(before),
+                          initial_good=sum(map(good, before)), unit=name.replace("_", " "))
     with closing(Rows(file, known.items())) as rows:
         for job, result in found:
             known[key(job)] = finite(result)
@@ -50,12 +50,12 @@ def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], d
     return [known[key(job)] for job in jobs]
 
 
-def flown(effort: Effort, name: str, tasks: Sequence[Task], good: Callable[[RunResult], bool] = lambda r: r.cause == SUCCESS) -> list[RunResult]:
-    """Runs of a campaign's engine, which keep their numbers when others are added; arguments as those of `computed`."""
-    found = computed(effort, name, tasks, _carried_out, lambda row: good(RunResult(**row)), lambda task: str(task.run.number),
-                     lambda task: asdict(dead(task)))
+def cached_runs(effort: Effort, name: str, tasks: Sequence[Task], good: Callable[[RunResult], bool] = lambda r: r.cause == SUCCESS) -> list[RunResult]:
+    """Runs of a campaign's engine, which keep their numbers when others are added; arguments as those of `cached_figures`."""
+    found = cached_figures(effort, name, tasks, _carried_out, lambda row: good(RunResult(**row)), lambda task: str(task.run.number),
+                     lambda task: asdict(failed_run(task)))
     return [RunResult(**row) for row in found]
 
 
 def _carried_out(task: Task) -> dict[str, Any]:
-    return asdict(carry_out(task))
+    return asdict(run_task(task))

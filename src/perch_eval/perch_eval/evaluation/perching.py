@@ -19,7 +19,7 @@ from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
-from perch_eval.evaluation.kept import flown
+from perch_eval.evaluation.kept import cached_runs
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.flight_view import FlightView
 from perch_eval.in_process import Sensing, fly
@@ -51,7 +51,7 @@ def perching_sections(effort: Effort) -> list[Section]:
 def perches(effort: Effort) -> dict[str, list[RunResult]]:
     """The flights of each condition; finished ones of the same code are not flown again."""
     jobs = enumerate(product(effort.seeds, (*CONDITIONS, AGGRESSIVE)))
-    found = flown(effort, "flights", [Task(Run(number, seed, {"scenario": name}), extended_mapping("scenarios", name), "in_process", SENSING)
+    found = cached_runs(effort, "flights", [Task(Run(number, seed, {"scenario": name}), extended_mapping("scenarios", name), "in_process", SENSING)
                                       for number, (seed, name) in jobs])
     return {name: [r for r in found if r.values["scenario"] == name] for name in (*CONDITIONS, AGGRESSIVE)}
 
@@ -74,9 +74,9 @@ def _errors(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
             medians = []
             for axis, value in zip("xyz", values):
                 errors = [r.metrics.get(f"{kind}_rmse_m_{axis}") for r in groups[name]]
-                spread = Spread.of(errors)
+                spread = Spread.from_values(errors)
                 medians.append(spread.median)
-                out.compare(f"{_words(name)}: {kind} {axis}", spread.words(100, 1, "cm"), f"{100 * value:.2f} cm", spread.median <= value)
+                out.compare(f"{_words(name)}: {kind} {axis}", spread.to_text(100, 1, "cm"), f"{100 * value:.2f} cm", spread.median <= value)
                 out.data[f"{name}_{kind}_{axis}"] = errors
             ours, theirs = math.hypot(*medians), math.hypot(*values)
             out.claim(f"{_words(name)}: {kind}, all axes", f"{100 * ours:.1f} cm", f"{100 * theirs:.1f} cm", ours <= theirs,
@@ -89,7 +89,7 @@ def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
                   f"{_seeds(effort)}; a success: the vehicle is attached to the pad at the end, and the mission reports it. "
                   "95 % Wilson intervals.")
     for name, paper in SUCCESSES.items():
-        rate = Rate.of(r.cause == SUCCESS for r in groups[name])
+        rate = Rate.from_outcomes(r.cause == SUCCESS for r in groups[name])
         bar = BARS[name] if effort.full else paper / 5
         why = f"at least {100 * bar:.0f} %" + ("" if effort.full else ", the paper's rate")
         causes = ", ".join(f"seed {r.seed}: {r.cause}" for r in groups[name] if r.cause != SUCCESS)
@@ -105,7 +105,7 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
     six = Section("m_fig_6", "[M] Fig. 6: body rates at 90 deg, 1.7 m", f"The figure shows seed 1, the rows {_seeds(effort)}.")
     scenario = load_scenario("surface_90")
     trace = fly(scenario, 1, SENSING, linger=0.5)
-    view = FlightView.of(trace.flight, load_vehicle(scenario.vehicle))
+    view = FlightView.from_flight(trace.flight, load_vehicle(scenario.vehicle))
     for section, name, figure, caption in (
             (five, "m_fig_5_tracking.png", plots.tracking_figure(view), "Position and velocity over time"),
             (five, "m_fig_5_path.png", plots.path_figure(view), "Path from the side with b3 as arrows"),
@@ -118,14 +118,14 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
     if contact:
         five.show("contact of seed 1", f"{contact[0].normal_speed:.2f} m/s along, {contact[0].tangential_speed:.2f} m/s across, tilt error "
                   f"{math.degrees(contact[0].tilt_error):.1f} deg", "0.4-0.6 m/s planned")
-    rates, fast = (Spread.of(r.metrics.get("max_body_rate_deg_s") for r in groups[name]) for name in ("surface_90", AGGRESSIVE))
-    peaks = Spread.of(r.metrics.get("max_acceleration_m_s2") for r in groups["surface_90"])
-    six.show("largest body rate, `surface_90`", rates.words(1.0, 0, "deg/s"))
-    six.claim(f"largest body rate, `{AGGRESSIVE}`", fast.words(1.0, 0, "deg/s"), f"close to {PEAK_RATE:g} deg/s",
+    rates, fast = (Spread.from_values(r.metrics.get("max_body_rate_deg_s") for r in groups[name]) for name in ("surface_90", AGGRESSIVE))
+    peaks = Spread.from_values(r.metrics.get("max_acceleration_m_s2") for r in groups["surface_90"])
+    six.show("largest body rate, `surface_90`", rates.to_text(1.0, 0, "deg/s"))
+    six.claim(f"largest body rate, `{AGGRESSIVE}`", fast.to_text(1.0, 0, "deg/s"), f"close to {PEAK_RATE:g} deg/s",
               0.9 * PEAK_RATE <= fast.median <= 1.1 * PEAK_RATE if groups[AGGRESSIVE] else None, "within 10 % of the paper's")
-    held = Rate.of(r.cause == SUCCESS for r in groups[AGGRESSIVE])
+    held = Rate.from_outcomes(r.cause == SUCCESS for r in groups[AGGRESSIVE])
     six.claim(f"perches, `{AGGRESSIVE}`", str(held), "", held.value >= 0.95 if held.trials else None, "at least 95 %")
-    six.claim("largest acceleration", peaks.words(1.0, 1, "m/s^2"), f"up to {PEAK_ACCELERATION:g} m/s^2", peaks.median >= 0.7 * PEAK_ACCELERATION,
+    six.claim("largest acceleration", peaks.to_text(1.0, 1, "m/s^2"), f"up to {PEAK_ACCELERATION:g} m/s^2", peaks.median >= 0.7 * PEAK_ACCELERATION,
               "at least 70 % of the paper's")
     return [five, six]
 

@@ -52,25 +52,25 @@ def _table(effort: Effort, vehicle: Vehicle) -> Section:
         problems = [waypoint_problem(np.random.default_rng(seed), waypoints) for seed in range(count)]
         printed = [found for p in problems if (found := _fastest(paper_m.plan, p, vehicle)).solved]
         out.data[f"qp_{waypoints}"] = [found.solve_time for found in printed]
-        ends = Spread.of(1.0 * len(found.iterations) for found in printed)
+        ends = Spread.from_values(1.0 * len(found.iterations) for found in printed)
         out.claim(f"stretching violating segments and their neighbours ends, {waypoints} waypoints", f"{len(printed)} of {count}", "all",
                   len(printed) == count, f"every problem is solved; {ends.median:.0f} QPs in the median")
-        qp = Spread.of(1e3 * found.solve_time for found in printed)
-        out.compare(f"QP + global bound check as printed, {waypoints} waypoints", qp.words(1.0, 1, "ms"), f"{paper_qp:g} ms",
+        qp = Spread.from_values(1e3 * found.solve_time for found in printed)
+        out.compare(f"QP + global bound check as printed, {waypoints} waypoints", qp.to_text(1.0, 1, "ms"), f"{paper_qp:g} ms",
                     qp.median <= paper_qp)
         nonlinear = [solve(found.iterations[-1].program, vehicle.mass, SETTINGS.thrust_max) for found in printed[:20]]
-        times = Spread.of(1e3 * n.solve_time for n in nonlinear if n.converged)
+        times = Spread.from_values(1e3 * n.solve_time for n in nonlinear if n.converged)
         out.data[f"nonlinear_{waypoints}"] = [n.solve_time for n in nonlinear]
         done = sum(n.converged for n in nonlinear)
-        out.show(f"nonlinear program (NLopt SLSQP), {waypoints} waypoints", times.words(1.0, 0, "ms"), f"{paper_nlp:g} ms",
+        out.show(f"nonlinear program (NLopt SLSQP), {waypoints} waypoints", times.to_text(1.0, 0, "ms"), f"{paper_nlp:g} ms",
                  f"{done} of {len(nonlinear)} converged; durations are given to it, which the paper's had to find")
         ratio = times.median / qp.median
         out.claim(f"nonlinear / QP as printed, {waypoints} waypoints", f"{ratio:.1f} x", f"{paper_nlp / paper_qp:.0f} x", ratio >= 2.0,
                   "checking after the QP is at least twice as fast as enforcing the bound, though numpy calls are most of its time")
         ours = [found for p in problems if (found := _fastest(planner.plan, replace(p, segment_times=None), vehicle)) is not None]
         out.data[f"shipped_{waypoints}"] = [found.solve_time for found in ours]
-        shipped = Spread.of(1e3 * found.solve_time for found in ours)
-        out.compare(f"what flies, {waypoints} waypoints", shipped.words(1.0, 2, "ms"), f"{paper_qp:g} ms", shipped.median <= paper_qp,
+        shipped = Spread.from_values(1e3 * found.solve_time for found in ours)
+        out.compare(f"what flies, {waypoints} waypoints", shipped.to_text(1.0, 2, "ms"), f"{paper_qp:g} ms", shipped.median <= paper_qp,
                     f"{len(ours)} of {count} planned, from its own first durations; every limit proved, single rotors too")
     return out
 

@@ -58,8 +58,8 @@ def _table(effort: Effort) -> Section:
             violated += sum(not bound.holds for bound in plan.bounds)
         out.data[case] = {"perch_s": perch, "recovery_s": recovery, "refused": refused}
         for name, values, paper in (("perch", perch, paper_perch), ("recovery", recovery, paper_recovery)):
-            spread = Spread.of(1e3 * v for v in values)
-            out.claim(f"{WORDS[case]}: {name}", spread.words(1.0, 0, "ms"), f"{paper} ms", spread.median <= paper,
+            spread = Spread.from_values(1e3 * v for v in values)
+            out.claim(f"{WORDS[case]}: {name}", spread.to_text(1.0, 0, "ms"), f"{paper} ms", spread.median <= paper,
                       "median at most the paper's")
         out.claim(f"{WORDS[case]}: starts solved, limits kept between nodes", f"{len(perch)}/{count}, {violated} violations",
                   "", len(perch) == count and violated == 0, "; ".join(refused) or "all, none")
@@ -83,7 +83,7 @@ def flown_sections(effort: Effort) -> list[Section]:
         runs, name = found[case, True], WORDS[case]
         missed = [r for r in runs if r.cause != SUCCESS]
         words = "; ".join(f"seed {r.seed}: {r.cause}: {r.message}" for r in missed)
-        out.show(f"{name}: gripped the cable", str(Rate.of(r.cause == SUCCESS for r in runs)), "", words)
+        out.show(f"{name}: gripped the cable", str(Rate.from_outcomes(r.cause == SUCCESS for r in runs)), "", words)
         for title, key, paper, factor, unit in (("position RMSE", "perching_position_m", paper_p, 100.0, "cm"),
                                                 ("pitch-roll RMSE", "perching_tilt_deg", paper_q, 1.0, "deg")):
             values = [value for r in runs if (value := r.metrics.get(key)) is not None]
@@ -94,7 +94,7 @@ def flown_sections(effort: Effort) -> list[Section]:
             else:
                 out.missing(f"{name}: {title}", f"{paper} {unit}", words or "no flight came to the perching point")
         for title, key in (("position in map", "perching_in_map_m"), ("mapping in map", "mapping_in_map_m")):
-            out.show(f"{name}: {title}", Spread.of(r.metrics.get(key) for r in runs).words(100.0, 1, "cm"))
+            out.show(f"{name}: {title}", Spread.from_values(r.metrics.get(key) for r in runs).to_text(100.0, 1, "cm"))
         mapped = [value for r in runs if (value := r.metrics.get("mapping_m")) is not None]
         error = 100.0 * float(np.mean(mapped)) if mapped else float("nan")
         out.claim(f"{name}: mapping", f"{error:.1f} cm ({len(mapped)} maps)", "", error <= 3.0 if mapped else None, "at most 3 cm in the mean")

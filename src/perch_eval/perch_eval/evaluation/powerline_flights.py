@@ -17,11 +17,11 @@ from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task, fly_in_process
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
-from perch_eval.evaluation.kept import flown
+from perch_eval.evaluation.kept import cached_runs
 from perch_eval.evaluation.sections import Effort
 from perch_eval.flight import Flight
 from perch_eval.in_process import Sensing
-from perch_eval.metrics import touch_of
+from perch_eval.metrics import contact_of
 from perch_sim.cable_contact import CableLine
 from perch_sim.scenario import Scenario
 
@@ -81,7 +81,7 @@ def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> d
     plan, perch_time = order.trajectory, order.contact_after
     assert isinstance(plan, SampledTrajectory) and perch_time is not None
     end = plan.start_time + perch_time
-    touch = touch_of(flight)
+    touch = contact_of(flight)
     if touch is not None and touch[1].state == 3 and touch[0] < end:
         return none  # crashed on the way
     moment = touch[0] if touch is not None and plan.start_time < touch[0] < end else end
@@ -140,5 +140,5 @@ def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], li
         if not grips:
             mapping["grip"] = mapping.get("grip", {}) | {"enabled": False}
         tasks.append(Task(Run(number, seed, {"scenario": case, "grips": grips}), mapping, ENGINE, RENDERED))
-    found = flown(effort, "line_flights", tasks, lambda r: r.cause == SUCCESS if r.values["grips"] else recovered(r))
+    found = cached_runs(effort, "line_flights", tasks, lambda r: r.cause == SUCCESS if r.values["grips"] else recovered(r))
     return {(case, grips): [r for r in found if r.values == {"scenario": case, "grips": grips}] for case in cases for grips in (True, False)}

@@ -17,7 +17,7 @@ from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
 from perch_eval.control_flights.aborted import fly_aborted
 from perch_eval.evaluation.document import table, write_page
-from perch_eval.evaluation.kept import computed
+from perch_eval.evaluation.kept import cached_figures
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.parameters import NodeParameters
 from perch_planner.perching_planner import PerchingPlannerParameters
@@ -55,7 +55,7 @@ def sections(effort: Effort) -> list[Section]:
                   f"powerlines: {LINE_PLANS} starts each.")
     jobs = [(name, seed) for name in map(str, INCLINATIONS) for seed in range(1, PLANS + 1)]
     jobs += [(name, seed) for name in LINES for seed in range(1, LINE_PLANS + 1)]
-    made = computed(effort, "ways_out", jobs, _planned, lambda r: not r["refused"])
+    made = cached_figures(effort, "ways_out", jobs, _planned, lambda r: not r["refused"])
     reasons: Counter[str] = Counter()
     rows: list[tuple[object, ...]] = []
     for name in (*map(str, INCLINATIONS), *LINES):
@@ -70,7 +70,7 @@ def sections(effort: Effort) -> list[Section]:
         out.claim(f"{title}: a way out {SURE:g} s before contact and earlier", f"{_share(early)}; {planned} of {len(plans)} planned", "",
                   planned == len(plans) and sum(not x.refusal for x in early) >= BAR * len(early) if early else None,
                   f"at least {100 * BAR:g} %, all planned")
-    flown = computed(effort, "aborted", list(_aborts()), _flown, lambda r: r["end"] in ("hovering", "attached"))
+    flown = cached_figures(effort, "aborted", list(_aborts()), _flown, lambda r: r["end"] in ("hovering", "attached"))
     text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
             *table(" | ".join(("plans", *(f"{low:g} to {high:g}" for low, high in pairwise(EDGES[:-1])), f"from {EDGES[-2]:g}", "all")), rows), "",
             "## Refused", ""]

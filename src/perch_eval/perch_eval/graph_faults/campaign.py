@@ -18,7 +18,7 @@ from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.evaluation.document import machine, table
-from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, NAMED, PHASES, REAL_TIME, SAFE, TRAFFIC, Case, cases
+from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, PHASES, REAL_TIME, REPORT_LIMIT, SAFE, TRAFFIC, Case, cases
 from perch_eval.graph_faults.flight import fly
 from perch_eval.revision import banner, commit, digest
 from perch_eval.rows import Rows, rows_of
@@ -32,9 +32,9 @@ EXAMPLES = """examples:
   python3 scripts/faults.py --again --only "stop controller"   fly them once more
   python3 scripts/faults.py --page                             write the page of what has been flown
 
-exit code: 0 every flight ended safely and said so, 1 one did not, 2 the caller's mistake, 130 interrupted"""
+exit code: 0 every flight ended safely and its fault was named, 1 otherwise, 2 invalid input, 130 interrupted"""
 ROWS = "rows.jsonl"
-FALL = 1.5  # speed beyond which an end on the floor is a fall [m/s]
+FALL_SPEED = 1.5  # of an impact on the floor that counts as a fall [m/s]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -50,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def _strike(args: argparse.Namespace) -> int:
+def _run(args: argparse.Namespace) -> int:
     output_folder(args.out), output_folder(args.logs, "--logs")
     chosen = [case for case in cases() if all(word in case.name for word in args.only.split())]
     if not chosen:
@@ -87,7 +87,7 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
     Raises:
         PerchError: the process of a flight has died again and again.
     """
-    with closing(Rows(file, rows.values())) as kept, closing(Progress(len(missing), what="flights")) as progress:
+    with closing(Rows(file, rows.values())) as kept, closing(Progress(len(missing), unit="flights")) as progress:
         for mode, at_once in ((LOCKSTEP, jobs), (REAL_TIME, 1)):
             for case, row in in_processes(partial(_fly, logs), [case for case in missing if case.mode == mode], at_once):
                 if isinstance(row, dict):
@@ -111,19 +111,19 @@ def _fly(logs: Path, case: Case) -> dict[str, Any] | str:
 
 
 def problems(row: dict[str, Any]) -> list[str]:
-    """What is not as it should be in a flight."""
+    """The problems of a flight."""
     if row["struck"] is None:
         return [f"the flight ended before the fault: {row['goal']}"]
     found = [] if row["end"] in SAFE else [f"ended {row['end']}"]
-    if (row["named"] is None or row["named"] > NAMED) and not tolerated(row):
+    if (row["named"] is None or row["named"] > REPORT_LIMIT) and not without_effect(row):
         found.append("not named" if row["named"] is None else f"named after {row['named']:.1f} s")
     found += [f"{name} ended, too" for name in row["ended"]] + [f"left: {one}" for one in row["left"]]
     return found
 
 
-def tolerated(row: dict[str, Any]) -> bool:
-    """Whether messages were disturbed and nobody said so in time, as nothing came of it: the flight perched."""
-    return row["fault"] in TRAFFIC and row["goal"].startswith("perched") and (row["named"] is None or row["named"] > NAMED)
+def without_effect(row: dict[str, Any]) -> bool:
+    """Whether disturbed messages had no effect (the flight perched) and were not reported in time."""
+    return row["fault"] in TRAFFIC and row["goal"].startswith("perched") and (row["named"] is None or row["named"] > REPORT_LIMIT)
 
 
 def _ends(rows: Sequence[dict[str, Any]]) -> str:
@@ -134,10 +134,10 @@ def _ends(rows: Sequence[dict[str, Any]]) -> str:
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """The page of what has been flown."""
     struck = [row for row in rows if row["struck"] is not None]
-    lost = Counter(row["node"] for row in struck if row["impact"] > FALL and row["end"] in SAFE)
+    hard_impacts = Counter(row["node"] for row in struck if row["impact"] > FALL_SPEED and row["end"] in SAFE)
     safe = [row for row in struck if row["end"] in SAFE]
-    through = [row for row in struck if tolerated(row)]
-    told = [row for row in struck if row["named"] is not None and row["named"] <= NAMED]
+    unaffected = [row for row in struck if without_effect(row)]
+    reported = [row for row in struck if row["named"] is not None and row["named"] <= REPORT_LIMIT]
     clean = [row for row in rows if not row["left"]]
     commits = Counter(row["commit"] for row in rows)
     text = ["# Faults on the real graph", "", banner(commits, [row.get("code", "") for row in rows]), "",
@@ -145,19 +145,19 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             f"{len(rows)} of {len(cases())} flights of `surface_90` at " + ", ".join(f"{name} ({n})" for name, n in commits.items())
             + f" on {machine()}.", "",
             f"* **{len(safe)} of {len(struck)} end safely**: hovering, landed, perched, or with the motors off on the ground.",
-            f"* **{len(told)} of {len(struck) - len(through)} are named within {NAMED:g} s** of the wall clock: a node, or who sent the",
-            "  goal, says who or whose messages are missing. The node that was struck is no witness, and what starts the processes is none.",
-            f"  Not counted: {len(through)} flights whose messages were disturbed and that perched as if they had not been.",
+            f"* **{len(reported)} of {len(struck) - len(unaffected)} are named within {REPORT_LIMIT:g} s** of the wall clock: a node, or who sent the",
+            "  goal, names the missing node or messages. The node that was struck does not count as a source, nor does what starts the",
+            f"  processes. Not counted: {len(unaffected)} flights whose messages were disturbed and that perched as if they had not been.",
             f"* **{len(clean)} of {len(rows)} leave nothing**: no process, no socket of the lockstep, no shared memory in the end.",
-            f"* {lost.total()} of those that end safely hit the floor with more than {FALL:g} m/s"
-            + (f"; struck were: {', '.join(f'{node} ({n})' for node, n in lost.items())}." if lost else "."),
+            f"* {hard_impacts.total()} of those that end safely hit the floor with more than {FALL_SPEED:g} m/s"
+            + (f"; struck were: {', '.join(f'{node} ({n})' for node, n in hard_impacts.items())}." if hard_impacts else "."),
             f"* In {sum(bool(row['ended']) for row in rows)} flights a node that was not struck ended.",
             "", "The node that is struck has a process of its own. In a quarter of the flights all others have, too; in the rest those",
-            "that do not look at images share one, as in `demo.py`. Cameras are off; VIO and tags are replaced by their error models",
+            "that do not use images share one, as in `demo.py`. Cameras are off; VIO and tags are replaced by their error models",
             "(`perch_eval.modelled_sight_node`). Processes are forked from one that has loaded the code: a restart is quick.",
             "In lockstep a node that hangs is waited for 8 s instead of 60; a plan begins 1.5 s after its request instead of 0.1. The end",
             "is judged by the truth, for a hover by the controller's state, too, when it has lasted for 4 s. *motors off*: on the ground",
-            "after a fall, or lying tilted; without a controller nobody else can hold the vehicle.", "",
+            "after a fall, or lying tilted; without a controller no other node can hold the vehicle.", "",
             *table("fault | what happens", FAULTS.items()), "",
             "Messages are disturbed by a relay between publisher and subscribers, which lockstep does not have (its batches go over",
             f"sockets of their own): in real time only. Phases: {', '.join(PHASES)}; messages are disturbed in search and approach, from",
@@ -176,4 +176,4 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(text) + "\n"
 
 
-main = command(parser, _strike, ValueError, interrupted="interrupted; what has been flown is kept, the same command goes on")
+main = command(parser, _run, ValueError, interrupted="interrupted; what has been flown is kept, the same command goes on")

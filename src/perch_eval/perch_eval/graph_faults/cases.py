@@ -21,7 +21,7 @@ TRAFFIC = {
 }
 FAULTS = PROCESS | TRAFFIC
 NODES = ("vio_model", "estimator", "target_localizer", "perching_planner", "controller", "mission")
-TALKERS = {
+DISTURBED_CHANNELS = {
     "vehicle": ("imu/data_raw",),
     "vio_model": ("vio/state", "vio/odometry"),
     "estimator": ("odometry", "estimator/status"),
@@ -29,15 +29,15 @@ TALKERS = {
     "controller": ("motor_command", "controller/status"),
     "mission": ("trajectory", "controller/command"),
 }
-"""Whose messages are disturbed, in real time: node -> channels. The planner answers requests, it publishes nothing that others take."""
+"""Node -> channels whose messages are disturbed, in real time. The planner answers requests, it publishes no messages for other nodes."""
 PHASES = ("climb", "search", "approach", "contact", "perched")
 LOCKSTEP, REAL_TIME = "lockstep", "real time"
 MODES = (LOCKSTEP, REAL_TIME)
 SAFE = ("hovering", "landed", "perched", "motors off")
 """Ends that are safe; `motors off`: on the ground, after a fall or lying there."""
-NAMED = 5.0  # wall-clock time from the fault within which it is named [s]
+REPORT_LIMIT = 5.0  # wall-clock time from the fault within which it must be reported [s]
 
-WORDS = {
+NODE_PATTERNS = {
     "vehicle": r"\bimu\b|imu/data_raw",
     "vio_model": r"\bvio",
     "estimator": r"estimator|odometry",
@@ -46,11 +46,11 @@ WORDS = {
     "controller": r"controller|motor_command|disarmed",
     "mission": r"\bmission\b",
 }
-"""What says who, or whose messages, are missing: the node's name, or a channel that is its own."""
-_TROUBLE = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|"
-                      r"restarted|back)\b", re.IGNORECASE)
-_ROUTINE = re.compile(r"looking for the target|waiting for the estimator$")
-"""What the mission tells of every flight."""
+"""Node -> pattern of a report that names it or its messages: its name, or one of its channels."""
+_FAULT_WORDS = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|"
+                          r"restarted|back)\b", re.IGNORECASE)
+_ROUTINE_MESSAGES = re.compile(r"looking for the target|waiting for the estimator$")
+"""Messages of the mission in every flight."""
 _LINE = re.compile(r"\[(?P<level>[A-Z]+)\] \[(?P<time>\d{9,}\.\d+)\] \[(?P<node>[\w.]+)\]: (?P<text>.*)")
 
 
@@ -73,7 +73,7 @@ class Case(NamedTuple):
         return int(self._digest[:7], 16)
 
     @property
-    def alone(self) -> bool:
+    def separate_processes(self) -> bool:
         """Whether every node has a process of its own; otherwise the struck one has, and most of the others share one, as in `demo.py`."""
         return self.seed % 4 == 0
 
@@ -85,7 +85,7 @@ class Case(NamedTuple):
 def cases() -> list[Case]:
     """All of them, so mixed that the first n are a sample of all."""
     found = [Case(*one) for one in product(PROCESS, NODES, PHASES, MODES)]
-    found += [Case(fault, node, phase, REAL_TIME) for fault, node, phase in product(TRAFFIC, TALKERS, ("search", "approach"))]
+    found += [Case(fault, node, phase, REAL_TIME) for fault, node, phase in product(TRAFFIC, DISTURBED_CHANNELS, ("search", "approach"))]
     return sorted(found, key=lambda case: case._digest)
 
 
@@ -98,7 +98,7 @@ class Situation(NamedTuple):
         tilt: [deg].
         rotors: of the fastest one [rad/s].
         held: velcro or gripper holds.
-        hovers: the controller says so.
+        hovers: reported by the controller.
     """
 
     height: float
@@ -110,7 +110,7 @@ class Situation(NamedTuple):
 
 
 def ending(now: Situation) -> str:
-    """How a flight has ended, by the truth; for a hover the controller's word is needed, too."""
+    """How a flight has ended, by the truth; a hover must be reported by the controller, too."""
     if now.held and now.speed < 0.1 and now.rotors < 50.0:
         return "perched"
     if now.rotors < 50.0 and now.height < 0.15 and now.speed < 0.1:
@@ -120,20 +120,20 @@ def ending(now: Situation) -> str:
     return "held with running motors" if now.held else "on the ground with running motors" if now.height < 0.15 else "in flight"
 
 
-def named(case: Case, struck: float, lines: Iterable[str], said: Iterable[tuple[float, str]]) -> tuple[float, str] | None:
-    """When after the fault [s], and by which words, who and what it is was said; None: never.
+def first_report(case: Case, fault_time: float, lines: Iterable[str], received: Iterable[tuple[float, str]]) -> tuple[float, str] | None:
+    """Time after the fault [s] and text of its first report; None: there is none.
 
     Args:
-        case: the fault; the node that it strikes is no witness.
-        struck: when, seconds since the epoch.
+        case: the fault; its node does not count as a source.
+        fault_time: when, seconds since the epoch.
         lines: of all logs, each with level, seconds since the epoch, node.
-        said: (seconds since the epoch, words) of who sent the goal.
+        received: (seconds since the epoch, text) of who sent the goal.
     """
-    words = re.compile(WORDS[case.node], re.IGNORECASE)
-    found = [(time - struck, f"pilot: {text}") for time, text in said
-             if time >= struck and words.search(text) and _TROUBLE.search(text) and not _ROUTINE.match(text)]
+    pattern = re.compile(NODE_PATTERNS[case.node], re.IGNORECASE)
+    found = [(time - fault_time, f"pilot: {text}") for time, text in received
+             if time >= fault_time and pattern.search(text) and _FAULT_WORDS.search(text) and not _ROUTINE_MESSAGES.match(text)]
     for line in filter(None, map(_LINE.match, lines)):
-        after, text = float(line["time"]) - struck, line["text"]
-        if line["node"] != case.node and after >= 0.0 and words.search(text) and (_TROUBLE.search(text) or line["level"] != "INFO"):
+        after, text = float(line["time"]) - fault_time, line["text"]
+        if line["node"] != case.node and after >= 0.0 and pattern.search(text) and (_FAULT_WORDS.search(text) or line["level"] != "INFO"):
             found.append((after, f"{line['node']}: {text}"))
     return min(found, default=None)

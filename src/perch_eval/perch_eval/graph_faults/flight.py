@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from perch_core.errors import PerchError
-from perch_eval.domain import own_domain
+from perch_eval.domain import domain_in_environment
 from perch_eval.fork_server import alive
-from perch_eval.graph_faults.cases import LOCKSTEP, NAMED, PROCESS, SAFE, Case, Situation, ending, named
+from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, REPORT_LIMIT, SAFE, Case, Situation, ending, first_report
 from perch_eval.graph_faults.group import Group
 from perch_eval.graph_faults.ros.watcher import Watcher
-from perch_eval.modelled_sight_node import blind_launches
+from perch_eval.modelled_sight_node import imageless_launches
 from perch_eval.ros.mission_client import MissionClient
 from perch_sim import seeding
 from perch_sim.contact_event import ContactState
@@ -32,12 +32,12 @@ parameters: {perching_planner: {time_limit: 20.0}, mission: {mission.plan_lead: 
 """What is flown: without images. A busy machine may take its time to plan, 1.5 s instead of 0.1; the lockstep goes on without a node
 that hangs after 8 s instead of 60."""
 DOMAINS = range(43, 70)
-READY = 60.0     # for the nodes to come up [s]
-STALL = 30.0     # simulation time may stand still for so long [s]
-SETTLE = 4.0     # an end that lasts so long is one, in simulation time [s]
-LIMIT = 60.0     # after the fault a flight is judged as it is, wall clock [s]
+READY_TIMEOUT = 60.0  # for the nodes to come up [s]
+STALL_TIMEOUT = 30.0  # simulation time may stand still for so long [s]
+SETTLING_TIME = 4.0   # an end that lasts so long is one, in simulation time [s]
+TIME_LIMIT = 60.0     # after the fault a flight is judged as it is, wall clock [s]
 UNANSWERED = "unanswered"
-NEAR = 0.15      # of the centre of mass from the pad: the contact begins [m]
+CONTACT_DISTANCE = 0.15  # of the centre of mass from the pad where the contact begins [m]
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Row:
         end: hovering, landed, perched, motors off; anything else is not safe.
         named: after so many seconds of wall-clock time the fault was named; None: never.
         words: by whom, and how.
-        goal: the mission's result, or what the pilot knows of it.
+        goal: the mission's result, or the pilot's error.
         impact: fastest touch of the floor or a wall after the fault [m/s].
         ended: other nodes that ended by themselves.
         left: processes, sockets, shared memory that were left when all had been stopped.
@@ -77,12 +77,13 @@ class Row:
     duration: float
 
 
-class _Director:
-    """Waits for the moment, and makes the fault happen.
+class _FaultInjector:
+    """Injects the fault when its time has come.
 
     Attributes:
-        struck: when, seconds since the epoch; None: not yet.
-        at: the same in simulation time [s].
+        received: (seconds since the epoch, message) of the mission and the nodes.
+        injection_wall_time: of the fault, seconds since the epoch; None: not yet injected.
+        injection_time: the same in simulation time [s].
         before: the situation then.
     """
 
@@ -91,26 +92,26 @@ class _Director:
         self._share = float(seeding.stream(case.seed, "moment").uniform(0.2, 0.9))
         self._height, self._pad = takeoff_height, pad
         self._phase, self._since, self._duration = "", 0.0, 0.0
-        self.said: list[tuple[float, str]] = []
-        self.struck: float | None = None
-        self.at: float | None = None
+        self.received: list[tuple[float, str]] = []
+        self.injection_wall_time: float | None = None
+        self.injection_time: float | None = None
         self.before = Situation(0.0, 0.0, 0.0, 0.0, False, False)
 
     def on_phase(self, t: float, phase: str, message: str) -> None:
-        """Of the mission's feedback; what is said otherwise is kept, too."""
-        self.said.append((time.time(), message))
+        """Handle the mission's feedback; every message is kept."""
+        self.received.append((time.time(), message))
         if phase != self._phase and phase not in ("waiting", "cancelling"):
             self._phase, self._since = phase, self._watcher.time
             planned = re.match(r"perching, ([\d.]+) s", message)
             self._duration = float(planned[1]) if planned else self._duration
 
-    def look(self) -> None:
-        """Strike, if it is time."""
-        if self.struck is not None or not self._now():
+    def apply_if_due(self) -> None:
+        """Inject the fault if its time has come."""
+        if self.injection_wall_time is not None or not self._is_due():
             return
         case, group = self._case, self._group
         self.before = self._watcher.situation() or self.before
-        self.at, self.struck = self._watcher.time, time.time()
+        self.injection_time, self.injection_wall_time = self._watcher.time, time.time()
         if case.fault not in PROCESS:
             self._watcher.disturb(case.fault)
         elif case.fault == "stop":
@@ -122,22 +123,23 @@ class _Director:
                     time.sleep(0.001)
                 group.start(case.node)
 
-    def follow(self) -> None:
-        """As `look`, while the goal is awaited.
+    def check_goal(self) -> None:
+        """As `apply_if_due`, while the goal is awaited.
 
         Raises:
-            PerchError: the mission does not run any more, and the fault has had its time to be named; nobody else answers to the goal.
+            PerchError: the mission does not run any more, and the time to report the fault is over; no other node answers the goal.
         """
-        self.look()
-        if self._case.node == "mission" and self._case.fault in ("kill", "stop") and self.struck is not None and self.told:
+        self.apply_if_due()
+        mission_lost = self._case.node == "mission" and self._case.fault in ("kill", "stop")
+        if mission_lost and self.injection_wall_time is not None and self.report_time_over:
             raise PerchError(UNANSWERED)
 
     @property
-    def told(self) -> bool:
-        """Whether what has been struck has had its time to be named."""
-        return self.struck is None or time.time() - self.struck > NAMED + 0.5
+    def report_time_over(self) -> bool:
+        """Whether the time to report the fault is over."""
+        return self.injection_wall_time is None or time.time() - self.injection_wall_time > REPORT_LIMIT + 0.5
 
-    def _now(self) -> bool:
+    def _is_due(self) -> bool:
         phase, elapsed, watcher = self._phase, self._watcher.time - self._since, self._watcher
         if self._case.phase == "climb":
             return phase == "take_off" and watcher.height > self._share * self._height
@@ -146,7 +148,7 @@ class _Director:
         if self._case.phase == "approach":
             return phase == "tracking" and elapsed > self._share * (self._duration - 0.2)
         if self._case.phase == "contact":
-            return phase in ("tracking", "verifying") and (self._pad.normal @ (watcher.position - self._pad.p_WS)) < NEAR
+            return phase in ("tracking", "verifying") and (self._pad.normal @ (watcher.position - self._pad.p_WS)) < CONTACT_DISTANCE
         return phase == "perched" and elapsed > 0.5 * self._share
 
 
@@ -167,52 +169,53 @@ def fly(case: Case, folder: Path, commit: str) -> Row:
     source.write_text(SCENARIO)
     scenario, lockstep = load_scenario(source), case.mode == LOCKSTEP
     hold = {"mission": {"lockstep_hold": "perch"}} if lockstep else None
-    launches = blind_launches(scenario, case.seed, str(source), lockstep, overrides=hold)
-    with own_domain(sorted(DOMAINS, key=lambda d: (d - case.seed) % len(DOMAINS))) as domain:
+    launches = imageless_launches(scenario, case.seed, str(source), lockstep, overrides=hold)
+    with domain_in_environment(sorted(DOMAINS, key=lambda d: (d - case.seed) % len(DOMAINS))) as domain:
         group, pilot = Group(launches, case, folder, domain), MissionClient()
         try:
             watcher = Watcher(pilot)
-            director = _Director(case, group, watcher, scenario.mission.takeoff_height, pad_surface(scenario, 0.0))
+            injector = _FaultInjector(case, group, watcher, scenario.mission.takeoff_height, pad_surface(scenario, 0.0))
             group.start_all()
-            limit = time.monotonic() + READY
+            limit = time.monotonic() + READY_TIMEOUT
             while missing := group.nodes - pilot.visible_nodes():
-                if time.monotonic() > limit or group.ended():
-                    raise PerchError(f"not ready: {', '.join(group.ended() or sorted(missing))}; logs: {folder}")
+                if time.monotonic() > limit or group.ended_processes():
+                    raise PerchError(f"not ready: {', '.join(group.ended_processes() or sorted(missing))}; logs: {folder}")
             try:
-                result = pilot.fly(scenario, director.on_phase, director.follow, stall=STALL)
+                result = pilot.fly(scenario, injector.on_phase, injector.check_goal, stall_timeout=STALL_TIMEOUT)
                 goal = f"{result.outcome}: {result.message}"
             except PerchError as error:
                 goal = str(error)
             if goal != UNANSWERED:
-                director.said.append((time.time(), goal))
-            end = _settled(pilot, watcher, director)
-            ended = tuple(name for name in group.ended() if name != case.node or case.fault == "restart" or case.fault not in PROCESS)
+                injector.received.append((time.time(), goal))
+            end = _wait_for_end(pilot, watcher, injector)
+            ended = tuple(name for name in group.ended_processes() if name != case.node or case.fault == "restart" or case.fault not in PROCESS)
         finally:
             group.stop()
             pilot.close()
             gc.collect()  # a goal is a cycle that holds the pilot's DDS participant
-            left = group.left()
-    found = named(case, director.struck, group.lines(), director.said) if director.struck is not None else None
-    touched = [c.normal_speed for c in watcher.contacts if c.state in (ContactState.COLLISION, ContactState.GROUND)
-               and director.at is not None and 1e-9 * c.stamp >= director.at]
+            left = group.leftovers()
+    found = (first_report(case, injector.injection_wall_time, group.log_lines(), injector.received)
+             if injector.injection_wall_time is not None else None)
+    impacts = [c.normal_speed for c in watcher.contacts if c.state in (ContactState.COLLISION, ContactState.GROUND)
+               and injector.injection_time is not None and 1e-9 * c.stamp >= injector.injection_time]
     after, words = (None, "") if found is None else (round(found[0], 2), found[1][:300])
-    return Row(*case, case.seed, commit, director.at, director.before[:3], end, after, words, goal[:300],
-               round(max(touched, default=0.0), 2), ended, left, round(time.monotonic() - began, 1))
+    return Row(*case, case.seed, commit, injector.injection_time, injector.before[:3], end, after, words, goal[:300],
+               round(max(impacts, default=0.0), 2), ended, left, round(time.monotonic() - began, 1))
 
 
-def _settled(pilot: MissionClient, watcher: Watcher, director: _Director) -> str:
-    """Wait until an end lasts, and the fault has had its time to be named."""
-    limit, since, last = time.monotonic() + LIMIT, watcher.time, ""
+def _wait_for_end(pilot: MissionClient, watcher: Watcher, injector: _FaultInjector) -> str:
+    """Wait until an end is stable, and the time to report the fault is over."""
+    limit, since, last = time.monotonic() + TIME_LIMIT, watcher.time, ""
     while time.monotonic() < limit:
         pilot.spin(0.05)
-        director.look()
-        director.said += [(time.time(), words) for words in pilot.news()]
+        injector.apply_if_due()
+        injector.received += [(time.time(), words) for words in pilot.node_events()]
         now = watcher.situation()
         if now is None:
             continue
         found = ending(now)
         if found != last:
             last, since = found, watcher.time
-        if found in SAFE and watcher.time - since > SETTLE and director.told:
+        if found in SAFE and watcher.time - since > SETTLING_TIME and injector.report_time_over:
             return found
-    return f"{last}, which does not last" if last in SAFE else last
+    return f"{last}, not stable" if last in SAFE else last

@@ -10,16 +10,16 @@ from contextlib import suppress
 from pathlib import Path
 
 from perch_eval.fork_server import alive, session, start
-from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, TALKERS, Case
+from perch_eval.graph_faults.cases import DISTURBED_CHANNELS, LOCKSTEP, PROCESS, Case
 from perch_eval.graph_faults.relay_node import DIRECT
-from perch_eval.modelled_sight_node import MODULE, NODES as SIGHTS
+from perch_eval.modelled_sight_node import MODULE, NODES as MODELLED_NODES
 from perch_eval.node_launch import NodeLaunch
 from perch_eval.nodes import ros_arguments
-from perch_eval.shared_memory import PORT, SharedMemory, of_ports, segment
+from perch_eval.shared_memory import PORT, SharedMemory, port_files, segment
 
-STOPPING = (5.0, 2.0)  # for a process to end after SIGINT and after SIGKILL [s]
-GOING = 10.0     # for what processes had open to vanish after their end, on a busy machine [s]
-NICE = 10        # of flights in lockstep: those in real time go first
+STOP_TIMEOUTS = (5.0, 2.0)  # for a process to end after SIGINT and after SIGKILL [s]
+CLEANUP_TIME = 10.0  # for resources of processes to vanish after their end, on a busy machine [s]
+NICE = 10            # of flights in lockstep: those in real time go first
 
 
 class Group:
@@ -34,28 +34,28 @@ class Group:
         """
         Args:
             launches: the nodes.
-            case: says who has a process, and whose messages pass the relay.
+            case: determines which nodes have a process, and which messages pass the relay.
             folder: receives parameters and logs.
             domain: ROS domain.
         """
         self._folder, self._domain, self._nice = folder, domain, NICE if case.mode == LOCKSTEP else 0
-        self._commands = {one.name: (f"{MODULE}:{one.name.upper()}" if one.name in SIGHTS else f"{one.module}:NODE", ros_arguments(one, folder))
-                          for one in launches}
+        self._commands = {one.name: (f"{MODULE}:{one.name.upper()}" if one.name in MODELLED_NODES else f"{one.module}:NODE",
+                                     ros_arguments(one, folder)) for one in launches}
         self.nodes = {f"/{name}" for name in self._commands}
-        together = [] if case.alone else [one for one in launches if one.name not in (*SIGHTS, case.node)]
+        together = [] if case.separate_processes else [one for one in launches if one.name not in (*MODELLED_NODES, case.node)]
         if together:
             plan = [{"name": one.name, "module": one.module, "arguments": self._commands.pop(one.name)[1]} for one in together]
             (folder / "composed.json").write_text(json.dumps(plan))
             self._commands["composed"] = "perch_eval.composed_node:main", [str(folder / "composed.json")]
         if case.fault not in PROCESS:
-            channels = TALKERS[case.node]
+            channels = DISTURBED_CHANNELS[case.node]
             self._commands[case.node][1][1:1] = [text for channel in channels for text in ("-r", f"{channel}:={DIRECT}/{channel}")]
             self._commands["relay"] = "perch_eval.graph_faults.relay_node:main", [*channels, "--ros-args"]
             self.nodes.add("/relay")
         self.pids: dict[str, int] = {}
         self._sessions: list[int] = []
         self._memory = SharedMemory()
-        self._before = of_ports(domain)
+        self._ports_before = port_files(domain)
 
     def start(self, name: str) -> None:
         """Start a node, for the first time or again."""
@@ -75,31 +75,31 @@ class Group:
         self._memory.observe(self.pids.values())
         os.kill(self.pids[name], number)
 
-    def ended(self) -> tuple[str, ...]:
+    def ended_processes(self) -> tuple[str, ...]:
         """Nodes whose processes have ended."""
         return tuple(name for name, pid in self.pids.items() if not alive(pid))
 
-    def lines(self) -> list[str]:
-        """Everything that was written."""
+    def log_lines(self) -> list[str]:
+        """The lines of all logs."""
         return [line for name in self._commands for line in (self._folder / f"{name}.log").read_text(errors="replace").splitlines()]
 
     def stop(self) -> None:
         """End everything. The pilot must still be there: shared memory of this process is cleaned, too, when it has left."""
         self._memory.observe((*self.pids.values(), os.getpid()))
         running = [pid for pid in self.pids.values() if alive(pid)]
-        for number, patience in zip((signal.SIGINT, signal.SIGKILL), STOPPING):
+        for number, timeout in zip((signal.SIGINT, signal.SIGKILL), STOP_TIMEOUTS):
             for pid in running:
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGCONT)
                     os.kill(pid, number)
-            end = time.monotonic() + patience
+            end = time.monotonic() + timeout
             while time.monotonic() < end and (running := [pid for pid in running if alive(pid)]):
                 self._memory.observe(running)
                 time.sleep(0.02)
 
-    def left(self) -> tuple[str, ...]:
+    def leftovers(self) -> tuple[str, ...]:
         """What is left when all have been stopped, the pilot included, in words; shared memory is cleaned first."""
-        end = time.monotonic() + GOING
+        end = time.monotonic() + CLEANUP_TIME
         while True:  # threads of a process that has ended may hold what it had open for a moment
             self._memory.clean()
             processes = [f"process {pid}" for leader in self._sessions for pid in session(leader)]
@@ -109,12 +109,12 @@ class Group:
             time.sleep(0.1)
 
     def _sockets(self) -> list[str]:
-        mine = f"perch-lockstep-{os.getuid()}-{self._domain}-"
-        return [f"socket {line.split()[-1]}" for line in Path("/proc/net/unix").read_text().splitlines() if mine in line]
+        prefix = f"perch-lockstep-{os.getuid()}-{self._domain}-"
+        return [f"socket {line.split()[-1]}" for line in Path("/proc/net/unix").read_text().splitlines() if prefix in line]
 
     def _shared_memory(self) -> list[str]:
         """Segments of these processes, or of a port of their domain, that no process uses any more or whose maker has ended."""
-        ports = of_ports(self._domain) - self._before  # other ports are shared with other domains
-        found = ports | {Path(name) for name in self._memory.seen if Path(name).exists() and not PORT.match(Path(name).name)}
+        ports = port_files(self._domain) - self._ports_before  # other ports are shared with other domains
+        found = ports | {Path(name) for name in self._memory.segments if Path(name).exists() and not PORT.match(Path(name).name)}
         unused = SharedMemory().unused(map(segment, found))
         return [f"shared memory {file.name}" for file in sorted(found) if segment(file) in unused]

@@ -1,6 +1,6 @@
 """What the fork server of these flights loads: the code of every node, and with a flight in process the compiled kernels.
 
-It works when it is imported: that is all that a fork server can be told to do.
+It works when it is imported: a fork server can only import.
 """
 
 from __future__ import annotations

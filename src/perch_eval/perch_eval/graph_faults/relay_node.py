@@ -1,4 +1,4 @@
-"""Passes messages on, and disturbs them when it is told to: a node publishes on `direct/<channel>`, and the others hear this one.
+"""Forwards messages, and disturbs them on request: a node publishes on `direct/<channel>`, the others receive from this node.
 
     python3 -m perch_eval.graph_faults.relay_node odometry estimator/status --ros-args
 
@@ -22,45 +22,45 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
 from perch_core.ros import topics
-from perch_core.ros.joining import join
+from perch_core.ros.ros_init import init_ros
 from perch_core.ros.node import StopSignal, spin_until_stopped
 
 DIRECT = "direct"
 DELAY = 0.2    # [s]
-PERIOD = 0.002  # between looks for what is due [s]
+PERIOD = 0.002  # of publishing delayed messages that are due [s]
 
 
 class Disturbance:
-    """What becomes of the messages of one channel."""
+    """The disturbance of the messages of one channel."""
 
     def __init__(self, seed: int = 1) -> None:
         self.fault = ""
         self._rng = random.Random(seed)
-        self._kept: list[Any] = []
-        self._late: deque[tuple[float, Any]] = deque()
+        self._held: list[Any] = []
+        self._delayed: deque[tuple[float, Any]] = deque()
 
-    def passed(self, message: Any, now: float) -> list[Any]:
-        """What goes on when a message comes, at a time of the monotonic clock [s]."""
+    def forward(self, message: Any, now: float) -> list[Any]:
+        """The messages to publish when one is received, at a time of the monotonic clock [s]."""
         if self.fault == "delay":
-            self._late.append((now + DELAY, message))
+            self._delayed.append((now + DELAY, message))
             return []
         if self.fault == "drop":
             return [] if self._rng.random() < 0.5 else [message]
         if self.fault == "duplicate":
             return [message, message]
         if self.fault == "reorder":
-            self._kept.append(message)
-            if len(self._kept) < 2:
+            self._held.append(message)
+            if len(self._held) < 2:
                 return []
-            found, self._kept = self._kept[::-1], []
+            found, self._held = self._held[::-1], []
             return found
         return [message]
 
     def due(self, now: float) -> list[Any]:
-        """What was delayed until now."""
+        """The messages that were delayed until now."""
         found = []
-        while self._late and self._late[0][0] <= now:
-            found.append(self._late.popleft()[1])
+        while self._delayed and self._delayed[0][0] <= now:
+            found.append(self._delayed.popleft()[1])
         return found
 
 
@@ -69,40 +69,40 @@ class RelayNode(Node):
 
     def __init__(self, channels: list[str]) -> None:
         super().__init__("relay")
-        self._ways: list[tuple[Disturbance, Publisher]] = []
+        self._relays: list[tuple[Disturbance, Publisher]] = []
         for k, channel in enumerate(channels):
             row = topics.topic(channel)
-            way = Disturbance(k), self.create_publisher(row.message, channel, row.qos.publish)
-            self._ways.append(way)
-            self.create_subscription(row.message, f"{DIRECT}/{channel}", partial(self._take, *way), row.qos.subscribe, raw=True)
-        self.create_subscription(String, "relay/fault", self._change, topics.topic("trajectory").qos.subscribe)
-        self._timer = self.create_timer(PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            relay = Disturbance(k), self.create_publisher(row.message, channel, row.qos.publish)
+            self._relays.append(relay)
+            self.create_subscription(row.message, f"{DIRECT}/{channel}", partial(self._on_message, *relay), row.qos.subscribe, raw=True)
+        self.create_subscription(String, "relay/fault", self._on_fault, topics.topic("trajectory").qos.subscribe)
+        self._timer = self.create_timer(PERIOD, self._publish_due, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._timer.cancel()
 
-    def _take(self, disturbance: Disturbance, publisher: Publisher, message: bytes) -> None:
-        for one in disturbance.passed(message, time.monotonic()):
+    def _on_message(self, disturbance: Disturbance, publisher: Publisher, message: bytes) -> None:
+        for one in disturbance.forward(message, time.monotonic()):
             publisher.publish(one)
 
-    def _look(self) -> None:
-        for disturbance, publisher in self._ways:
+    def _publish_due(self) -> None:
+        for disturbance, publisher in self._relays:
             for one in disturbance.due(time.monotonic()):
                 publisher.publish(one)
 
-    def _change(self, message: String) -> None:
-        for disturbance, _ in self._ways:
+    def _on_fault(self, message: String) -> None:
+        for disturbance, _ in self._relays:
             disturbance.fault = message.data
         if message.data == "delay":
             self._timer.reset()
 
 
 def main() -> None:
-    """Pass on the channels of the command line until SIGINT or SIGTERM."""
+    """Forward the channels of the command line until SIGINT or SIGTERM."""
     end = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
     stop = StopSignal()
-    join(sys.argv)
+    init_ros(sys.argv)
     node, executor = RelayNode(sys.argv[1:end]), EventsExecutor()
     executor.add_node(node)
-    stop.patient = True
+    stop.defer = True
     spin_until_stopped(executor, stop)
     node.destroy_node()
     rclpy.try_shutdown()

@@ -1,1 +1,1 @@
-"""What a vehicle answers to its commands, from a flight: lags, delay and gains of its inner loop, thrust, drag."""
+"""Response of a vehicle to its commands, identified from a flight: lags, delay and gains of its inner loop, thrust, drag."""

@@ -13,12 +13,12 @@ from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.arguments import command, command_parser
 from perch_eval.flight import Flight
 from perch_eval.identification import flight
-from perch_eval.identification.answers import Answer, answers_figure
-from perch_eval.identification.fit import Found, battery, identify
+from perch_eval.identification.fit import Estimate, battery, identify
 from perch_eval.identification.record import record_of
+from perch_eval.identification.responses import Response, response_figure
 from perch_sim.scenario import load_scenario
 
-GENTLY = 1.4  # times as long as usual takes a move on another voltage: it asks for half the acceleration
+GENTLE_STRETCH = 1.4  # factor of the duration of moves at other voltages: they need half the acceleration
 EXAMPLES = """examples:
   python3 scripts/identify.py --vehicle snapdragon_rates                    fly in the simulator, and identify
   python3 scripts/identify.py --vehicle snapdragon_rates --scenario x.yaml  the same on a vehicle that differs (disturbance:)
@@ -27,8 +27,8 @@ EXAMPLES = """examples:
   python3 scripts/identify.py --vehicle mine.yaml --recording full.mcap half.mcap low.mcap --voltage 16.4 15.2 14.0   with the battery's curve
 
 files: vehicle.yaml (extends the vehicle, with standard deviations), identify.png
-exit code: 0 everything is told, 1 something is not (the reasons beside it), 2 wrong arguments, a flight that tells
-nothing, or a battery that no curve fits"""
+exit code: 0 all values identified, 1 some are not identifiable (with the reasons), 2 wrong arguments, an unusable flight,
+or no fitting battery curve"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -54,7 +54,7 @@ def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> Sequence[Flight]
     voltages = arguments.voltage
     if voltages:
         if len(voltages) < 2 or not all(0.0 < one < 100.0 for one in voltages):
-            raise PerchError(f"--voltage: needs two and more of 0 to 100 V, not {voltages}")
+            raise PerchError(f"--voltage: needs two or more values between 0 and 100 V, not {voltages}")
         if vehicle.actuation.type != "rates_and_thrust":
             raise PerchError(f"--voltage: {arguments.vehicle} takes {vehicle.actuation.type}, not rates_and_thrust")
         if vehicle.actuation.battery.reference not in (0.0, voltages[0]):
@@ -62,85 +62,86 @@ def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> Sequence[Flight]
     if arguments.recording:
         if len(arguments.recording) != max(len(voltages), 1):
             raise PerchError(f"--recording: {len(arguments.recording)} files, and {len(voltages)} voltages (--voltage)")
-        from perch_eval.recorded import opened
+        from perch_eval.recorded import read_flight
 
-        return [opened(file) for file in arguments.recording]
+        return [read_flight(file) for file in arguments.recording]
     if voltages and not vehicle.actuation.firmware:
         raise PerchError(f"--voltage: the simulated battery drives the motors of a firmware, and {arguments.vehicle} has none")
     scenario = load_scenario(arguments.scenario)
     flown = [flight.fly(scenario, arguments.vehicle, arguments.seed)]
     for one in voltages[1:]:
         at = replace(scenario, disturbance=replace(scenario.disturbance, voltage_factor=one / voltages[0]))
-        flown.append(flight.fly(at, arguments.vehicle, arguments.seed, GENTLY))
+        flown.append(flight.fly(at, arguments.vehicle, arguments.seed, GENTLE_STRETCH))
     return flown
 
 
 def _identify(arguments: argparse.Namespace) -> int:
-    """Fly or read, fit, write, tell."""
+    """Fly or read, fit, write, print."""
     vehicle = load_vehicle(arguments.vehicle)
     flown_as = ", ".join(map(str, arguments.recording)) or f"simulated flight, scenario {arguments.scenario}, seed {arguments.seed}"
     flown = flights(arguments, vehicle)
-    found, answers = identify(record_of(flown[0]), vehicle)
+    estimates, responses = identify(record_of(flown[0]), vehicle)
     if arguments.voltage:
         gains = [next(one for one in identify(record_of(one), vehicle)[0] if one.key == "actuation.thrust_gain") for one in flown]
         curve = vehicle.actuation.battery
-        found.append(battery(arguments.voltage, gains, curve.exponent if curve.reference else 0.0))
-        if found[-1].refused:
-            raise PerchError(f"--voltage: no curve of the battery fits: {found[-1].refused}")
+        estimates.append(battery(arguments.voltage, gains, curve.exponent if curve.reference else 0.0))
+        if estimates[-1].reason:
+            raise PerchError(f"--voltage: no curve of the battery fits: {estimates[-1].reason}")
     arguments.out.mkdir(parents=True, exist_ok=True)
     is_file = arguments.vehicle.endswith((".yaml", ".yml"))
     base = config.find("vehicles", arguments.vehicle).resolve() if is_file else arguments.vehicle
     name = arguments.name or f"{vehicle.name}_identified"
-    (arguments.out / "vehicle.yaml").write_text(entries(found, vehicle, str(base), name, flown_as, arguments.voltage))
-    draw(arguments.out / "identify.png", found, answers, f"{vehicle.name}: {flown_as}")
-    print("\n".join(map(str, found)))
+    (arguments.out / "vehicle.yaml").write_text(vehicle_file_text(estimates, vehicle, str(base), name, flown_as, arguments.voltage))
+    draw(arguments.out / "identify.png", estimates, responses, f"{vehicle.name}: {flown_as}")
+    print("\n".join(map(str, estimates)))
     if not arguments.voltage:
-        print(f"{'actuation.battery':32s} not identified: flights at two voltages and more tell it (--voltage)")
+        print(f"{'actuation.battery':32s} not identified: needs flights at two or more voltages (--voltage)")
     print(f"written: {arguments.out / 'vehicle.yaml'}, {arguments.out / 'identify.png'}")
-    return 1 if any(one.refused for one in found) else 0
+    return 1 if any(one.reason for one in estimates) else 0
 
 
-def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flight: str, voltages: Sequence[float] = ()) -> str:
+def vehicle_file_text(estimates: Sequence[Estimate], vehicle: Vehicle, base: str, name: str, flight: str,
+                      voltages: Sequence[float] = ()) -> str:
     """A vehicle file that extends `base` by what was identified; all else stays as it is there, with the reason in a comment.
 
     Args:
-        found: what was identified.
+        estimates: what was identified.
         vehicle: as it was known so far.
         base: its name, or its file.
         name: of the identified vehicle.
-        flight: of which it was identified, in words.
+        flight: its source, as text.
         voltages: of the flights [V], the first one that of the thrust curve.
     """
     lines: list[str] = []
-    for key in dict.fromkeys(one.key.split("[")[0] for one in found):
-        group = [one for one in found if one.key.split("[")[0] == key]
+    for key in dict.fromkeys(one.key.split("[")[0] for one in estimates):
+        group = [one for one in estimates if one.key.split("[")[0] == key]
         owner = vehicle.actuation if key.startswith("actuation.") else vehicle
         field = key.split(".")[-1]
-        if key == "actuation.battery.exponent" and not group[0].refused:
+        if key == "actuation.battery.exponent" and not group[0].reason:
             text = f"{{reference: {voltages[0]:g}, exponent: {group[0].value:.4g}, range: [{min(voltages):g}, {max(voltages):g}]}}"
             lines.append(f"  battery: {text}  # exponent +- {group[0].sigma:.2g}")
         old = getattr(owner, field, None)
         if old is None:
             continue
-        new = [old[i] if one.refused else one.value for i, one in enumerate(group)] if isinstance(old, tuple) else group[0].value
-        told = not all(one.refused for one in group)
+        new = [old[i] if one.reason else one.value for i, one in enumerate(group)] if isinstance(old, tuple) else group[0].value
+        identified = not all(one.reason for one in group)
         axes = [f"{'xyz'[i]} " if len(group) > 1 else "" for i in range(len(group))]
-        sigmas = "; ".join(f"{axis}+- {one.sigma:.2g} {one.unit}".rstrip() for axis, one in zip(axes, group) if not one.refused)
+        sigmas = "; ".join(f"{axis}+- {one.sigma:.2g} {one.unit}".rstrip() for axis, one in zip(axes, group) if not one.reason)
         text = f"[{', '.join(f'{x:.4g}' for x in new)}]" if isinstance(new, list) else f"{new:.5g}"
         indent = "  " if key.startswith("actuation.") else ""
-        lines += [f"{indent}# {field}: {axis}not identified: {one.refused}" for axis, one in zip(axes, group) if one.refused]
-        if told:
+        lines += [f"{indent}# {field}: {axis}not identified: {one.reason}" for axis, one in zip(axes, group) if one.reason]
+        if identified:
             lines.append(f"{indent}{field}: {text}".ljust(45) + f"# {sigmas}")
-    mine, inner = [line for line in lines if not line.startswith("  ")], [line for line in lines if line.startswith("  ")]
+    outer, inner = [line for line in lines if not line.startswith("  ")], [line for line in lines if line.startswith("  ")]
     head = [f"# Identified by scripts/identify.py, with standard deviations. Of: {flight}", f"extends: {base}", f"name: {name}"]
-    return "\n".join([*head, *mine, *(["actuation:", f"  type: {vehicle.actuation.type}", *inner] if inner else [])]) + "\n"
+    return "\n".join([*head, *outer, *(["actuation:", f"  type: {vehicle.actuation.type}", *inner] if inner else [])]) + "\n"
 
 
-def draw(file: Path, found: Sequence[Found], answers: Sequence[Answer], title: str) -> None:
-    """The answers, and below them what was found."""
-    figure = answers_figure([replace(answer, t=answer.t - answer.t[0]) for answer in answers])
+def draw(file: Path, estimates: Sequence[Estimate], responses: Sequence[Response], title: str) -> None:
+    """The responses, and below them the estimates."""
+    figure = response_figure([replace(response, t=response.t - response.t[0]) for response in responses])
     figure.suptitle(title)
-    figure.supxlabel("\n".join(map(str, found)), family="monospace", fontsize=8, x=0.02, ha="left")
+    figure.supxlabel("\n".join(map(str, estimates)), family="monospace", fontsize=8, x=0.02, ha="left")
     figure.savefig(file, dpi=95)
 
 

@@ -6,7 +6,7 @@
 
 The battery's curve comes of several records, one at each voltage.
 
-A value that the record does not tell is refused with the reason, and not written.
+A value that is not identifiable from the record has a reason, and is not written.
 """
 
 from __future__ import annotations
@@ -19,43 +19,43 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from perch_core.vehicle import GRAVITY, Vehicle
-from perch_eval.identification.answers import Answer, lagged
 from perch_eval.identification.record import Record
+from perch_eval.identification.responses import Response, first_order_lag
 
 PARTS = 6            # of the record, fitted one by one for the scatter
-LEAST_RATE = 0.3     # standard deviation of a command below which nothing can be seen in the answer [rad/s]
-LEAST_THRUST = 0.5   # [m/s^2]
-LEAST_SPEED = 0.25   # of the air along an axis, for its drag [m/s]
-EXPLAINED = 0.9      # share of the answer's variance that the model must explain
-LEAST_VOLTAGES = 0.08  # between the greatest and the least voltage, as a share
-MISFIT = 0.03        # of the thrust at a voltage from its curve, as a share
-CERTAIN = 0.2        # a value is told where its standard deviation is below this share of it ...
-DELAY_CERTAIN = 0.003  # ... and a delay below this [s]
+MIN_RATE = 0.3       # standard deviation of a command for a usable response [rad/s]
+MIN_THRUST = 0.5     # [m/s^2]
+MIN_SPEED = 0.25     # of the air along an axis, for its drag [m/s]
+MIN_EXPLAINED = 0.9  # share of the response's variance that the model must explain
+MIN_VOLTAGE_RANGE = 0.08  # between the greatest and the least voltage, as a share
+MAX_MISFIT = 0.03    # of the thrust at a voltage from its curve, as a share
+MAX_RELATIVE_SIGMA = 0.2  # standard deviation of an identified value, as a share of it
+MAX_DELAY_SIGMA = 0.003   # of an identified delay [s]
 
 
 @dataclass(frozen=True)
-class Found:
+class Estimate:
     """A value of the vehicle file.
 
     Attributes:
         key: in the file, with the axis in brackets: `actuation.rate_lag[0]`.
         value, sigma: with its standard deviation, in `unit`.
-        refused: why the record does not tell it; empty: it does.
+        reason: why it is not identifiable from the record; empty: it is identified.
     """
 
     key: str
     value: float
     sigma: float
     unit: str
-    refused: str = ""
+    reason: str = ""
 
     def __str__(self) -> str:
-        refused = f"   not identified: {self.refused}" if self.refused else ""
-        return f"{self.key:32s} {self.value:10.4g} +- {self.sigma:.2g} {self.unit}{refused}"
+        reason = f"   not identified: {self.reason}" if self.reason else ""
+        return f"{self.key:32s} {self.value:10.4g} +- {self.sigma:.2g} {self.unit}{reason}"
 
 
-def _fitted(model: Callable[[np.ndarray], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],
-            high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+def _fit_parameters(model: Callable[[np.ndarray], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],
+                    high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Parameters of `model(parameters)`, and their standard deviations: the scatter of fits to parts / sqrt(their number)."""
     def fit(samples: slice, x0: Sequence[float] | np.ndarray) -> np.ndarray:
         return least_squares(lambda x: (model(x) - measured)[samples], x0, bounds=(low, high),
@@ -63,38 +63,38 @@ def _fitted(model: Callable[[np.ndarray], np.ndarray], measured: np.ndarray, sta
 
     whole, cuts = fit(slice(None), start), np.linspace(0, len(measured), PARTS + 1).astype(int)
     parts = np.array([fit(slice(a, b), whole) for a, b in zip(cuts, cuts[1:])])
-    weight = np.array([np.var(measured[a:b]) for a, b in zip(cuts, cuts[1:])])  # a part in which nothing happens tells nothing
+    weight = np.array([np.var(measured[a:b]) for a, b in zip(cuts, cuts[1:])])  # a part without motion has no information
     weight /= max(weight.sum(), 1e-12)
     spread = np.sqrt(weight @ (parts - whole) ** 2)
     return whole, spread * np.sqrt(np.sum(weight**2))
 
 
-def _judged(key: str, value: float, sigma: float, unit: str, why: str, bound: float | None = None) -> Found:
-    bound = CERTAIN * abs(value) if bound is None else bound
-    if not why and sigma == inf:
-        why = "it depends on the delay, which is not identified"
-    elif not why and sigma > bound:
-        why = f"its standard deviation of {sigma:.2g} {unit} is more than {bound:.2g}; fly longer and harder".replace("  ", " ")
-    return Found(key, float(value), float(sigma), unit, why)
+def _estimate(key: str, value: float, sigma: float, unit: str, reason: str, bound: float | None = None) -> Estimate:
+    bound = MAX_RELATIVE_SIGMA * abs(value) if bound is None else bound
+    if not reason and sigma == inf:
+        reason = "it depends on the delay, which is not identified"
+    elif not reason and sigma > bound:
+        reason = f"its standard deviation of {sigma:.2g} {unit} is more than {bound:.2g}; fly longer, with larger commands".replace("  ", " ")
+    return Estimate(key, float(value), float(sigma), unit, reason)
 
 
-def _untold(answer: Answer, least: float) -> str:
-    """Why an answer tells nothing of its loop: commands of less than `least` (1 sigma), or another model; empty: it does."""
-    size = float(np.std(answer.command))
-    if size < least:
-        return f"commands of {size:.2g} {answer.unit} (1 sigma) are too small; {least:g} are needed"
-    if answer.explained < EXPLAINED:
-        return f"a lag of first order explains {100 * answer.explained:.0f} % of the answer; {100 * EXPLAINED:.0f} are needed"
+def _not_identifiable(response: Response, min_size: float) -> str:
+    """Why a loop is not identifiable from a response: commands below `min_size` (1 sigma), or another model; empty: it is."""
+    size = float(np.std(response.command))
+    if size < min_size:
+        return f"commands of {size:.2g} {response.unit} (1 sigma) are too small; {min_size:g} are needed"
+    if response.explained < MIN_EXPLAINED:
+        return f"a first-order lag explains {100 * response.explained:.0f} % of the response; {100 * MIN_EXPLAINED:.0f} are needed"
     return ""
 
 
-def rates(record: Record, axis: int, delay: float | None = None, spread: float = 0.0) -> tuple[list[Found], Answer]:
+def rates(record: Record, axis: int, delay: float | None = None, spread: float = 0.0) -> tuple[list[Estimate], Response]:
     """Lag and gain of one axis of the rate loop with a delay, or with the delay that fits it best, which is then the third.
 
     Args:
         record: the flight.
         axis: x, y or z.
-        delay, spread: with its standard deviation [s]. Of commands that are slow against the lag an answer tells the sum of both, so
+        delay, spread: with its standard deviation [s]. Of commands that are slow against the lag a response determines the sum of both, so
             that the delay's uncertainty is the lag's, too.
     """
     h, w, free, known = record.period, record.gyro[:, axis], delay is None, delay or 0.0
@@ -102,44 +102,44 @@ def rates(record: Record, axis: int, delay: float | None = None, spread: float =
     sent = record.rates[:, axis]
 
     def model(x: np.ndarray) -> np.ndarray:
-        late = x[3] if free else known
-        return lagged(x[1] * record.commanded(sent, late + h), x[0], h) + x[2]
+        applied_delay = x[3] if free else known
+        return first_order_lag(x[1] * record.commands_at(sent, applied_delay + h), x[0], h) + x[2]
 
     n = 4 if free else 3
-    x, sigma = _fitted(model, w, (0.04, 1.0, 0.0, 0.005)[:n], (1e-3, 0.2, -0.5, -0.01)[:n], (0.5, 5.0, 0.5, 0.1)[:n])
-    answer = Answer(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.commanded(sent, 0.0), w, model(x))
-    why = _untold(answer, LEAST_RATE)
-    found = [_judged(f"actuation.rate_lag[{axis}]", x[0], float(np.hypot(sigma[0], spread)), "s", why),
-             _judged(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", why)]
-    return found + ([_judged("actuation.delay", max(x[3], 0.0), sigma[3], "s", why, DELAY_CERTAIN)] if free else []), answer
+    x, sigma = _fit_parameters(model, w, (0.04, 1.0, 0.0, 0.005)[:n], (1e-3, 0.2, -0.5, -0.01)[:n], (0.5, 5.0, 0.5, 0.1)[:n])
+    response = Response(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.commands_at(sent, 0.0), w, model(x))
+    reason = _not_identifiable(response, MIN_RATE)
+    estimates = [_estimate(f"actuation.rate_lag[{axis}]", x[0], float(np.hypot(sigma[0], spread)), "s", reason),
+                 _estimate(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", reason)]
+    return estimates + ([_estimate("actuation.delay", max(x[3], 0.0), sigma[3], "s", reason, MAX_DELAY_SIGMA)] if free else []), response
 
 
-def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) -> tuple[list[Found], Answer]:
+def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) -> tuple[list[Estimate], Response]:
     """Lag and gain of the thrust, and the drag along z; of the rotors where their speeds are commanded. For `spread` see `rates`."""
     h, f, rotors = record.period, record.accel[:, 2], record.rotor_speeds is not None
     sent = record.rotor_speeds if record.rotor_speeds is not None else record.thrust
     assert sent is not None
     keys = ("motor_time_constant", "thrust_coefficient") if rotors else ("actuation.thrust_lag", "actuation.thrust_gain")
     unit = vehicle.thrust_coefficient / vehicle.mass if rotors else 1.0
-    u = record.commanded(sent, h if rotors else delay + h)
+    u = record.commands_at(sent, h if rotors else delay + h)
 
     def model(x: np.ndarray) -> np.ndarray:
         lag, gain, drag = x
-        felt = gain * unit * np.sum(lagged(u, lag, h) ** 2, axis=1) if rotors else lagged(gain * u, lag, h)
-        return felt - drag * record.v_B[:, 2]
+        specific_thrust = gain * unit * np.sum(first_order_lag(u, lag, h) ** 2, axis=1) if rotors else first_order_lag(gain * u, lag, h)
+        return specific_thrust - drag * record.v_B[:, 2]
 
-    x, sigma = _fitted(model, f, (0.04, 1.0, 0.05), (1e-3, 0.2, -5.0), (0.5, 5.0, 5.0))
+    x, sigma = _fit_parameters(model, f, (0.04, 1.0, 0.05), (1e-3, 0.2, -5.0), (0.5, 5.0, 5.0))
     command = unit * np.sum(u**2, axis=1) if rotors else u
-    answer = Answer("specific thrust", "m/s^2", record.t, command, f, model(x))
-    why = _untold(answer, LEAST_THRUST)
+    response = Response("specific thrust", "m/s^2", record.t, command, f, model(x))
+    reason = _not_identifiable(response, MIN_THRUST)
     scale = vehicle.thrust_coefficient if rotors else 1.0
-    certain = float(np.hypot(sigma[1], x[1] * vehicle.imu.accel_bias_init / GRAVITY))  # the accelerometer's own offset looks like thrust
-    return [_judged(keys[0], x[0], float(np.hypot(sigma[0], spread)), "s", why),
-            _judged(keys[1], scale * x[1], scale * certain, "N s^2/rad^2" if rotors else "", why),
-            _drag(2, vehicle.mass * x[2], vehicle.mass * sigma[2], record)], answer
+    gain_sigma = float(np.hypot(sigma[1], x[1] * vehicle.imu.accel_bias_init / GRAVITY))  # the accelerometer's bias looks like thrust
+    return [_estimate(keys[0], x[0], float(np.hypot(sigma[0], spread)), "s", reason),
+            _estimate(keys[1], scale * x[1], scale * gain_sigma, "N s^2/rad^2" if rotors else "", reason),
+            _drag(2, vehicle.mass * x[2], vehicle.mass * sigma[2], record)], response
 
 
-def battery(voltages: Sequence[float], gains: Sequence[Found], flown: float = 0.0) -> Found:
+def battery(voltages: Sequence[float], gains: Sequence[Estimate], applied_exponent: float = 0.0) -> Estimate:
     """Exponent k of the thrust at a throttle, (voltage / first voltage)^k, by weighted least squares on logarithms.
 
     The standard deviation is that of the gains, or their scatter about the curve where that is larger.
@@ -147,7 +147,7 @@ def battery(voltages: Sequence[float], gains: Sequence[Found], flown: float = 0.
     Args:
         voltages: of the flights [V].
         gains: of the thrust, one of each flight.
-        flown: exponent by which the throttle already followed the voltage in these flights.
+        applied_exponent: exponent by which the throttle already followed the voltage in these flights.
     """
     x = np.log(np.asarray(voltages) / voltages[0])
     y = np.log([gain.value / gains[0].value for gain in gains])[1:]
@@ -155,52 +155,53 @@ def battery(voltages: Sequence[float], gains: Sequence[Found], flown: float = 0.
     covariance = np.diag(noise[1:] ** 2) + noise[0] ** 2  # the first gain is in every ratio
     W, x1 = np.linalg.inv(covariance), x[1:]
     information = float(x1 @ W @ x1)
-    more = float(x1 @ W @ y / max(information, 1e-12))
-    k, left, free = flown + more, y - more * x1, len(y) - 1
-    scatter = float(np.sqrt(max(float(left @ W @ left) / free, 1.0))) if free else 1.0
-    sigma, spread, why = scatter / sqrt(max(information, 1e-12)), float(np.ptp(x)), next((one.refused for one in gains if one.refused), "")
-    if not why and spread < LEAST_VOLTAGES:
-        why = f"voltages are {100 * spread:.0f} % apart; {100 * LEAST_VOLTAGES:.0f} are needed"
-    elif not why and np.max(np.abs(left), initial=0.0) > MISFIT:
-        why = f"a power of the voltage misses the thrust by {100 * np.max(np.abs(left)):.0f} %; {100 * MISFIT:.0f} are allowed"
-    elif not why and not 0.5 <= k <= 4.0:
-        why = f"an exponent of {k:.2g} is no battery's: 0.5 to 4"
-    return _judged("actuation.battery.exponent", k, sigma, "", why)
+    correction = float(x1 @ W @ y / max(information, 1e-12))
+    k, residual, free = applied_exponent + correction, y - correction * x1, len(y) - 1
+    scatter = float(np.sqrt(max(float(residual @ W @ residual) / free, 1.0))) if free else 1.0
+    sigma, spread = scatter / sqrt(max(information, 1e-12)), float(np.ptp(x))
+    reason = next((one.reason for one in gains if one.reason), "")
+    if not reason and spread < MIN_VOLTAGE_RANGE:
+        reason = f"voltages are {100 * spread:.0f} % apart; {100 * MIN_VOLTAGE_RANGE:.0f} are needed"
+    elif not reason and np.max(np.abs(residual), initial=0.0) > MAX_MISFIT:
+        reason = f"a power of the voltage misses the thrust by {100 * np.max(np.abs(residual)):.0f} %; {100 * MAX_MISFIT:.0f} are allowed"
+    elif not reason and not 0.5 <= k <= 4.0:
+        reason = f"an exponent of {k:.2g} is outside the range of batteries, 0.5 to 4"
+    return _estimate("actuation.battery.exponent", k, sigma, "", reason)
 
 
-def drag(record: Record, vehicle: Vehicle, axis: int) -> Found:
+def drag(record: Record, vehicle: Vehicle, axis: int) -> Estimate:
     """Linear drag along x or y: the only force there in free air."""
     def model(x: np.ndarray) -> np.ndarray:
         return x[1] - x[0] * record.v_B[:, axis]
 
-    x, sigma = _fitted(model, record.accel[:, axis], (0.1, 0.0), (-5.0, -2.0), (5.0, 2.0))
+    x, sigma = _fit_parameters(model, record.accel[:, axis], (0.1, 0.0), (-5.0, -2.0), (5.0, 2.0))
     return _drag(axis, vehicle.mass * x[0], vehicle.mass * sigma[0], record)
 
 
-def _drag(axis: int, value: float, sigma: float, record: Record) -> Found:
+def _drag(axis: int, value: float, sigma: float, record: Record) -> Estimate:
     speed = float(np.std(record.v_B[:, axis]))
-    why = f"speeds of {speed:.2g} m/s (1 sigma) are too small; {LEAST_SPEED:g} are needed" if speed < LEAST_SPEED else ""
-    return _judged(f"drag[{axis}]", value, sigma, "N s/m", why or ("a negative drag" if value < 0.0 else ""))
+    reason = f"speeds of {speed:.2g} m/s (1 sigma) are too small; {MIN_SPEED:g} are needed" if speed < MIN_SPEED else ""
+    return _estimate(f"drag[{axis}]", value, sigma, "N s/m", reason or ("a negative drag" if value < 0.0 else ""))
 
 
-def identify(record: Record, vehicle: Vehicle) -> tuple[list[Found], list[Answer]]:
-    """Everything that the record can tell of a vehicle, and the answers for the page."""
-    found: list[Found] = []
-    answers: list[Answer] = []
+def identify(record: Record, vehicle: Vehicle) -> tuple[list[Estimate], list[Response]]:
+    """All values of a vehicle that the record gives, and the responses for the page."""
+    estimates: list[Estimate] = []
+    responses: list[Response] = []
     delay, spread = vehicle.actuation.delay, 0.0
     if record.rates is not None:
-        # One delay for all: that of roll and pitch, which turn the thrust; what yaw is later counts as its lag.
-        tilt = [part[2] for part, _ in (rates(record, axis) for axis in (0, 1)) if not part[2].refused]
+        # One delay for all: that of roll and pitch, which turn the thrust; a larger delay of yaw counts as its lag.
+        tilt = [part[2] for part, _ in (rates(record, axis) for axis in (0, 1)) if not part[2].reason]
         spread = inf
         if tilt:
             delay = float(np.mean([one.value for one in tilt]))
             spread = float(np.hypot(np.std([one.value for one in tilt]), max(one.sigma for one in tilt)))
         axes = [rates(record, axis, delay, spread) for axis in range(3)]
-        answers += [answer for _, answer in axes]
-        found += [one for part, _ in axes for one in part]
-        found.append(_judged("actuation.delay", delay, spread, "s", "" if tilt else "neither roll nor pitch tells it",
-                             DELAY_CERTAIN))
+        responses += [response for _, response in axes]
+        estimates += [one for part, _ in axes for one in part]
+        estimates.append(_estimate("actuation.delay", delay, spread, "s", "" if tilt else "not identifiable from roll or pitch",
+                                   MAX_DELAY_SIGMA))
     if record.thrust is not None or record.rotor_speeds is not None:
-        part, answer = thrust(record, vehicle, delay, spread)
-        found, answers = [*found, *part[:2], drag(record, vehicle, 0), drag(record, vehicle, 1), part[2]], [*answers, answer]
-    return found, answers
+        part, response = thrust(record, vehicle, delay, spread)
+        estimates, responses = [*estimates, *part[:2], drag(record, vehicle, 0), drag(record, vehicle, 1), part[2]], [*responses, response]
+    return estimates, responses

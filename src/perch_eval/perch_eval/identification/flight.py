@@ -1,4 +1,4 @@
-"""The flight that tells: a hover, short moves along each axis and turns, at rest in between."""
+"""The identification flight: a hover, short moves along each axis and turns, at rest in between."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Fl
 
     Args:
         scenario: the room and how the real vehicle differs from its file.
-        vehicle: name or file; what the controller believes.
+        vehicle: name or file; the model of the controller.
         seed: of everything that is random.
         stretch: of the moves' durations, where less thrust than usual is left.
 
@@ -46,5 +46,5 @@ def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Fl
             place, yaw = place + offset, yaw + turn
             flight.run(flight.time + duration + LEAD + PAUSE)
             if controller.state is not State.HOVERING:
-                raise PerchError(f"the vehicle does not fly by its file: {controller.flown.message}; correct its mass or its lags")
+                raise PerchError(f"the vehicle does not fly by its file: {controller.flight_state.message}; correct its mass or its lags")
     return flight.loop.trace.flight

@@ -10,9 +10,9 @@ from perch_core.errors import PerchError
 from perch_core.vehicle import GRAVITY
 from perch_eval.flight import Flight, interpolated
 
-SHORTEST = 5.0   # of a record in the air [s]
-ALOFT = 0.6      # specific force along b3 that means flying, as a share of gravity
-BEGIN = 1.5      # after that, the ground no longer matters [s]
+MIN_DURATION = 5.0    # of a record in the air [s]
+AIRBORNE_SHARE = 0.6  # specific force along b3 in flight, as a share of gravity
+SKIPPED_START = 1.5   # from take-off until the ground has no effect any more [s]
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Record:
         """Of the IMU [s]."""
         return float(np.median(np.diff(self.t)))
 
-    def commanded(self, values: np.ndarray, delay: float) -> np.ndarray:
+    def commands_at(self, values: np.ndarray, delay: float) -> np.ndarray:
         """Commands (m, ...) as they were `delay` before each IMU sample, between their stamps: (n, ...).
 
         A command that is held for a period h and read between its ends is h / 2 too early, and an IMU that gives means over its own period
@@ -73,13 +73,13 @@ def record_of(flight: Flight) -> Record:
     assert states is not None
     command_t = np.array([time for time, _ in sent])
     window = max(1, round(0.1 / float(np.median(np.diff(t)))))
-    aloft = np.convolve(f[:, 2], np.ones(window) / window, "same") > ALOFT * GRAVITY
-    moving = aloft & (t > command_t[0]) & (t < command_t[-1])
-    high = np.interp(t, states.t, states.p[:, 2])
-    moving &= high > high[0] + 0.3
-    if not moving.any() or t[moving][-1] - t[moving][0] < SHORTEST + BEGIN:
-        raise PerchError(f"less than {SHORTEST:g} s of it are in the air")
-    keep = (t > t[moving][0] + BEGIN) & (t < t[moving][-1] - 0.2)
+    airborne = np.convolve(f[:, 2], np.ones(window) / window, "same") > AIRBORNE_SHARE * GRAVITY
+    moving = airborne & (t > command_t[0]) & (t < command_t[-1])
+    height = np.interp(t, states.t, states.p[:, 2])
+    moving &= height > height[0] + 0.3
+    if not moving.any() or t[moving][-1] - t[moving][0] < MIN_DURATION + SKIPPED_START:
+        raise PerchError(f"less than {MIN_DURATION:g} s of the flight are in the air")
+    keep = (t > t[moving][0] + SKIPPED_START) & (t < t[moving][-1] - 0.2)
     velocity = np.array([value.v_B for _, value in sorted(flight.values("odometry"), key=lambda pair: pair[0])])
     v_B = interpolated(t[keep], states.t, velocity)
     rotors = channel == "motor_command"

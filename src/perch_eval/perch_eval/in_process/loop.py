@@ -7,7 +7,7 @@ from typing import Any
 
 from perch_core.component import Component
 from perch_core.errors import PerchError
-from perch_core.processes import one_thread_for_sums
+from perch_core.processes import single_threaded_blas
 from perch_core.values import PerchGoal, PerchResult, seconds
 from perch_eval.in_process.trace import FlightTrace
 from perch_sim.lockstep import LocalParticipant, Packet, Schedule, Task, local_servers
@@ -73,7 +73,7 @@ class Loop:
         Raises:
             PerchError: a component has no task.
         """
-        one_thread_for_sums()
+        single_threaded_blas()
         self.vehicle: Any = vehicle
         self.components: dict[str, Any] = {**components, **servers}
         self.filters: dict[tuple[str, str], Filter] = {}

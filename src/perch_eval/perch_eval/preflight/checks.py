@@ -1,4 +1,4 @@
-"""Judgements of what a graph has brought in a few seconds. Each has a verdict, what was seen, and what to do."""
+"""Checks of what was received from a graph in a few seconds. Each has a verdict, an observation, and advice."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from perch_core.values import CameraModel, ControllerStatus, ImuSample, Odometry
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_eval.consistency import attitude_error
 
-TILT = 10.0       # of a vehicle that stands on its feet, at most [deg]
-FORCE = 0.5       # of the mean specific force from gravity [m/s^2]
-STILL = 0.1       # mean body rate at rest [rad/s]
-GAP = 5.0         # periods between two stamps, at most
-LATE = 0.25       # of camera frames behind IMU samples of the same stamp [s]
-PIXELS = 3.0      # by which a point may lie elsewhere in the image than by the file's camera [px]
-EXTRINSICS = (0.02, 3.0)  # what a transform may differ from the file [m, deg]
-SHAKE = 5.0       # what the rotation from camera to IMU may differ from the file [deg]
-SCALE = 0.1       # share by which the gyroscope's rates may be larger or smaller than the camera's ...
-UNLIKE = 0.4      # ... and share of them that may be something else
-TURNED = 0.3      # root mean square of the rates about each axis that shaking needs [rad/s]
-ANSWER = 2.0      # from an order to its effect, heard by a program that shares the machine with others [s]
-STOPPED = 1.0     # from the last command to the motors' stop [s] ...
-DESCENDED = 5.0   # ... and where an autopilot levels and descends first [s]
+MAX_TILT = 10.0          # of a vehicle that stands on its feet [deg]
+MAX_FORCE_ERROR = 0.5    # of the mean specific force from gravity [m/s^2]
+MAX_REST_RATE = 0.1      # mean body rate at rest [rad/s]
+MAX_GAP = 5.0            # periods between two stamps
+MAX_DELAY = 0.25         # of camera frames behind IMU samples of the same stamp [s]
+MAX_PIXEL_ERROR = 3.0    # by which a point may lie elsewhere in the image than by the file's camera [px]
+MAX_EXTRINSICS_ERROR = (0.02, 3.0)  # of a transform from the file [m, deg]
+MAX_ROTATION_ERROR = 5.0  # of the rotation from camera to IMU from the file [deg]
+MAX_SCALE_ERROR = 0.1    # share by which the gyroscope's rates may be larger or smaller than the camera's
+MAX_RESIDUAL = 0.4       # share of the gyroscope's rates that the camera's may leave unexplained
+MIN_ROTATION_RATE = 0.3  # root mean square of the rates about each axis that shaking needs [rad/s]
+RESPONSE_TIME = 2.0      # from a command to its effect, observed by a program that shares the machine with others [s]
+STOP_TIME = 1.0          # from the last command to the motors' stop [s] ...
+DESCENT_TIME = 5.0       # ... and where an autopilot levels and descends first [s]
 RATES = {"imu/data_raw": (100.0, 1000.0), "odometry": (50.0, 1000.0), "camera_down/camera_info": (10.0, 120.0),
          "camera_front/camera_info": (5.0, 120.0)}
-"""Channel -> lowest and highest rate of its stamps [Hz]; a tenth is forgiven."""
+"""Channel -> lowest and highest rate of its stamps [Hz]; 10 % of tolerance."""
 _STATES = {state.value: state.name.lower() for state in State}
 
 
@@ -47,40 +47,40 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the table: what was looked at, the verdict, what was seen, and what to do where it has not passed."""
+    """One line of the table: what was checked, the verdict, the observation, and what to do where it has not passed."""
 
     name: str
     verdict: Verdict
-    seen: str
+    observation: str
     advice: str = ""
 
     def __str__(self) -> str:
         what_to_do = f"\n{'':15s}-> {self.advice}" if self.advice and self.verdict is not Verdict.PASSED else ""
-        return f"{self.verdict.value:14s} {self.name:28s} {self.seen}{what_to_do}"
+        return f"{self.verdict.value:14s} {self.name:28s} {self.observation}{what_to_do}"
 
 
-def judged(name: str, good: bool, seen: str, advice: str) -> Check:
+def make_check(name: str, good: bool, observation: str, advice: str) -> Check:
     """A check that passes or fails."""
-    return Check(name, Verdict.PASSED if good else Verdict.FAILED, seen, advice)
+    return Check(name, Verdict.PASSED if good else Verdict.FAILED, observation, advice)
 
 
-def stream(channel: str, stamps: Sequence[int]) -> list[Check]:
+def check_stream(channel: str, stamps: Sequence[int]) -> list[Check]:
     """Rate of a channel, and whether its stamps [ns] go on evenly."""
     low, high = RATES[channel]
     if len(stamps) < 3:
         return [Check(f"rate {channel}", Verdict.FAILED, f"{len(stamps)} messages",
-                      "start what publishes it; see namespaces, ROS_DOMAIN_ID and QoS (topic.py info)")]
+                      "start its publisher; check namespaces, ROS_DOMAIN_ID and QoS (topic.py info)")]
     gaps: np.ndarray = 1e-9 * np.diff(np.array(stamps, dtype=np.int64))
     period = float(np.median(gaps))
     rate = 1.0 / period if period > 0.0 else np.inf
-    return [judged(f"rate {channel}", 0.9 * low <= rate <= 1.1 * high, f"{rate:.4g} Hz",
-                   f"{low:g} to {high:g} Hz are needed: set the driver's rate"),
-            judged(f"stamps {channel}", bool((gaps > 0.0).all() and gaps.max() <= GAP * period),
-                   f"steps of {1e3 * gaps.min():.3g} to {1e3 * gaps.max():.3g} ms",
-                   "stamps must grow by a period each: stamp at the sensor, not at arrival; look for lost messages")]
+    return [make_check(f"rate {channel}", 0.9 * low <= rate <= 1.1 * high, f"{rate:.4g} Hz",
+                       f"{low:g} to {high:g} Hz are needed: set the driver's rate"),
+            make_check(f"stamps {channel}", bool((gaps > 0.0).all() and gaps.max() <= MAX_GAP * period),
+                       f"steps of {1e3 * gaps.min():.3g} to {1e3 * gaps.max():.3g} ms",
+                       "stamps must grow by a period each: stamp at the sensor, not at arrival; look for lost messages")]
 
 
-def rest(samples: Sequence[ImuSample]) -> list[Check]:
+def check_at_rest(samples: Sequence[ImuSample]) -> list[Check]:
     """Gravity and rates of a vehicle that stands still on its feet."""
     if len(samples) < 50:
         return [Check("gravity up", Verdict.FAILED, "no IMU", "see rate imu/data_raw")]
@@ -88,19 +88,19 @@ def rest(samples: Sequence[ImuSample]) -> list[Check]:
     size = float(np.linalg.norm(f))
     tilt = degrees(acos(np.clip(f[2] / max(size, 1e-9), -1.0, 1.0)))
     axis = int(np.argmax(np.abs(f)))
-    return [judged("gravity up", tilt < TILT, f"specific force [{f[0]:.2f}, {f[1]:.2f}, {f[2]:.2f}] m/s^2, {tilt:.1f} deg from +z",
-                   f"it must read +9.8 along z of base_link (forward-left-up), not along {'-' if f[axis] < 0 else '+'}{'xyz'[axis]}: "
-                   "stand the vehicle level, or turn the IMU's axes in its driver"),
-            judged("gravity's size", abs(size - GRAVITY) < FORCE, f"{size:.2f} m/s^2",
-                   "the accelerometer's unit or scale is wrong (m/s^2, not g or counts)"),
-            judged("gyroscope at rest", float(np.linalg.norm(w)) < STILL, f"{np.linalg.norm(w):.3f} rad/s",
-                   "keep it still and calibrate the gyroscope; rates are rad/s, not deg/s")]
+    return [make_check("gravity up", tilt < MAX_TILT, f"specific force [{f[0]:.2f}, {f[1]:.2f}, {f[2]:.2f}] m/s^2, {tilt:.1f} deg from +z",
+                       f"it must read +9.8 along z of base_link (forward-left-up), not along {'-' if f[axis] < 0 else '+'}{'xyz'[axis]}: "
+                       "stand the vehicle level, or turn the IMU's axes in its driver"),
+            make_check("gravity's size", abs(size - GRAVITY) < MAX_FORCE_ERROR, f"{size:.2f} m/s^2",
+                       "the accelerometer's unit or scale is wrong (m/s^2, not g or counts)"),
+            make_check("gyroscope at rest", float(np.linalg.norm(w)) < MAX_REST_RATE, f"{np.linalg.norm(w):.3f} rad/s",
+                       "keep it still and calibrate the gyroscope; rates are rad/s, not deg/s")]
 
 
-def clocks(imu: Sequence[tuple[float, int]], frames: Mapping[str, Sequence[tuple[float, int]]]) -> list[Check]:
+def check_clocks(imu: Sequence[tuple[float, int]], frames: Mapping[str, Sequence[tuple[float, int]]]) -> list[Check]:
     """Whether cameras and IMU share a clock: arrival [s] and stamp [ns] of each IMU sample, and of the frames of each camera.
 
-    The shortest way from stamp to arrival counts: a program that is late itself says nothing of the others.
+    The shortest time from stamp to arrival counts: it does not depend on delays of this program.
     """
     def shortest(arrivals: Sequence[tuple[float, int]]) -> float:
         return min(arrival - seconds(stamp) for arrival, stamp in arrivals)
@@ -109,13 +109,13 @@ def clocks(imu: Sequence[tuple[float, int]], frames: Mapping[str, Sequence[tuple
     for camera, arrivals in frames.items():
         if imu and arrivals:
             late = shortest(arrivals) - shortest(imu)
-            found.append(judged(f"clock camera_{camera}", -0.02 < late < LATE,
-                                f"frames arrive {1e3 * late:.1f} ms after their stamp, by the IMU's clock",
-                                f"0 to {1e3 * LATE:.0f} ms are plausible: camera and IMU need one clock, and stamps of the exposure"))
+            found.append(make_check(f"clock camera_{camera}", -0.02 < late < MAX_DELAY,
+                                    f"frames arrive {1e3 * late:.1f} ms after their stamp, by the IMU's clock",
+                                    f"0 to {1e3 * MAX_DELAY:.0f} ms are plausible: camera and IMU need one clock, and stamps of the exposure"))
     return found
 
 
-def camera_model(name: str, model: CameraModel | None, vehicle: Vehicle) -> Check:
+def check_camera_model(name: str, model: CameraModel | None, vehicle: Vehicle) -> Check:
     """A camera's intrinsics against the vehicle file."""
     mount, title = vehicle.mounts[name], f"camera_{name} model"
     if model is None:
@@ -127,9 +127,9 @@ def camera_model(name: str, model: CameraModel | None, vehicle: Vehicle) -> Chec
     known = np.isfinite(rays).all(axis=1)  # others lie beyond a fisheye's circle
     apart = np.linalg.norm(have.project(rays[known])[0] - pixels[known], axis=1)
     off = float(np.nan_to_num(apart, nan=np.inf).max())
-    return judged(title, (have.width, have.height) == (want.width, want.height) and off < PIXELS and model.frame == optical_frame(name),
-                  f"{_camera(have)}, frame {model.frame}: points lie up to {off:.1f} px from where the file has them",
-                  f"the file says {_camera(want)}, frame {optical_frame(name)}: calibrate, or name the right file")
+    good = (have.width, have.height) == (want.width, want.height) and off < MAX_PIXEL_ERROR and model.frame == optical_frame(name)
+    return make_check(title, good, f"{_camera(have)}, frame {model.frame}: points lie up to {off:.1f} px from where the file has them",
+                      f"the file has {_camera(want)}, frame {optical_frame(name)}: calibrate, or use the right file")
 
 
 def _camera(camera: Camera) -> str:
@@ -137,26 +137,26 @@ def _camera(camera: Camera) -> str:
             f"centre {camera.cx:.1f}, {camera.cy:.1f} px")
 
 
-def extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]:
+def check_extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]:
     """Fixed transforms of the graph against the vehicle file."""
     found = []
     for want in fixed_frames(vehicle):
         have = next((t for t in transforms if t.child == want.child), None)
         if have is None:
-            found.append(Check(f"extrinsics {want.child}", Verdict.OPEN, "nobody publishes it",
-                               "fine where the nodes take it from the vehicle file; else start `description`"))
+            found.append(Check(f"extrinsics {want.child}", Verdict.OPEN, "not published",
+                               "acceptable where the nodes take it from the vehicle file; else start `description`"))
             continue
         apart = float(np.linalg.norm(np.subtract(have.p, want.p)))
         turn = degrees(float(np.linalg.norm(attitude_error(np.array(want.q), np.array(have.q)))))
-        found.append(judged(f"extrinsics {want.child}", have.parent == want.parent and apart < EXTRINSICS[0] and turn < EXTRINSICS[1],
-                            f"{1e3 * apart:.0f} mm, {turn:.1f} deg from the file",
-                            "one of them is wrong: measure, calibrate, and correct it"))
+        found.append(make_check(
+            f"extrinsics {want.child}", have.parent == want.parent and apart < MAX_EXTRINSICS_ERROR[0] and turn < MAX_EXTRINSICS_ERROR[1],
+            f"{1e3 * apart:.0f} mm, {turn:.1f} deg from the file", "one of them is wrong: measure, calibrate, and correct it"))
     return found
 
 
-def frames(odometry: OdometryState | None, imu: ImuSample | None, placed: bool) -> list[Check]:
-    """Names of frames; `placed`: the nodes know the axes of the IMU."""
-    return [judged(f"frame {name}", value is not None and good, "nothing" if value is None else repr(value.frame), advice)
+def check_frames(odometry: OdometryState | None, imu: ImuSample | None, placed: bool) -> list[Check]:
+    """Names of frames; `placed`: the axes of the IMU are known to the nodes."""
+    return [make_check(f"frame {name}", value is not None and good, "nothing" if value is None else repr(value.frame), advice)
             for name, value, good, advice in (
                 ("odometry", odometry, odometry is not None and odometry.frame == "map", "must be 'map'"),
                 ("imu/data_raw", imu, placed, "must be 'imu_link', or placed in base_link by /tf_static or --sensors"))]
@@ -178,41 +178,41 @@ def camera_rotation(turned_B: np.ndarray, turned_C: np.ndarray) -> tuple[np.ndar
     return U @ Vt, float(np.linalg.svd(turned_B, compute_uv=False)[2] / np.sqrt(max(len(turned_B), 1)))
 
 
-def shaken(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehicle) -> Check:
+def check_rotation(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehicle) -> Check:
     """The rotation between a camera and the IMU, and the gyroscope's scale, from shaking the vehicle by hand.
 
     Arguments are those of `camera_rotation`.
     """
     title, advice = f"rotation camera_{name} to IMU", (
-        "turn the vehicle to and fro about all axes, by 20 deg, over something with texture (--shake)")
+        "rotate the vehicle back and forth about all axes, by 20 deg, over a textured surface (--shake)")
     if len(turned_B) < 20:
         return Check(title, Verdict.OPEN, f"{len(turned_B)} pairs of frames", advice)
     R, least = camera_rotation(turned_B, turned_C)
-    if least < TURNED:
-        return Check(title, Verdict.OPEN, f"{least:.2f} rad/s about the axis turned about least, {TURNED:g} are needed", advice)
+    if least < MIN_ROTATION_RATE:
+        return Check(title, Verdict.OPEN, f"{least:.2f} rad/s about the axis turned about least, {MIN_ROTATION_RATE:g} are needed", advice)
     if np.linalg.det(R) < 0.0:
         return Check(title, Verdict.FAILED, f"left-handed: R_BC would be {np.round(R, 2).tolist()}",
                      "the sign of one axis of the gyroscope is wrong (or of all three): correct it in its driver")
-    seen = turned_C @ R.T
-    scale = float(np.sum(turned_B * seen) / np.sum(seen**2))
-    if abs(scale - 1.0) > SCALE:
+    camera_rates = turned_C @ R.T
+    scale = float(np.sum(turned_B * camera_rates) / np.sum(camera_rates**2))
+    if abs(scale - 1.0) > MAX_SCALE_ERROR:
         return Check(title, Verdict.FAILED, f"the gyroscope reads {scale:.3g} times the camera's rates",
                      "its unit (rad/s) or scale is wrong, or the camera's focal length")
-    unlike = float(np.linalg.norm(turned_B - scale * seen) / np.linalg.norm(turned_B))
-    if unlike > UNLIKE:
-        return Check(title, Verdict.FAILED, f"{100 * unlike:.0f} % of the gyroscope's rates are not the camera's",
-                     "an axis of the gyroscope has another scale, the clocks differ, or the scene moves: see there, and shake again")
+    residual = float(np.linalg.norm(turned_B - scale * camera_rates) / np.linalg.norm(turned_B))
+    if residual > MAX_RESIDUAL:
+        return Check(title, Verdict.FAILED, f"{100 * residual:.0f} % of the gyroscope's rates are not the camera's",
+                     "an axis of the gyroscope has another scale, the clocks differ, or the scene moves: check these, and shake again")
     off = degrees(float(np.linalg.norm(so3.log(vehicle.mounts[name].R_BC.T @ R))))
-    return judged(title, off < SHAKE, f"{off:.1f} deg from the file",
-                  f"R_BC is about {np.round(R, 2).tolist()}: correct `orientation` in the vehicle file, or the IMU's axes")
+    return make_check(title, off < MAX_ROTATION_ERROR, f"{off:.1f} deg from the file",
+                      f"R_BC is about {np.round(R, 2).tolist()}: correct `orientation` in the vehicle file, or the IMU's axes")
 
 
 @dataclass(frozen=True)
-class Order:
-    """What an order to the controller led to.
+class CommandResult:
+    """The effect of a command to the controller.
 
     Attributes:
-        status: the first one that shows its effect, or the last that came.
+        status: the first one that shows its effect, or the last one received.
         delay: until its effect [s].
         armed: whether the commands to the vehicle after it were; None: there were none.
     """
@@ -222,30 +222,30 @@ class Order:
     armed: bool | None
 
 
-def obeyed(name: str, order: Order, state: int, armed: bool) -> Check:
-    """Whether an order has had its effect: the controller's state, and that of the commands to the vehicle."""
-    status = order.status
-    good = status is not None and status.state == state and order.delay <= ANSWER and order.armed is armed
-    sent = "none" if order.armed is None else "armed" if order.armed else "disarmed"
-    said = "no controller/status" if status is None else (
-        f"{_STATES.get(status.state, status.state)} after {order.delay:.2f} s, commands {sent}: {status.message[:80]}")
-    return judged(name, good, said, "the controller's message says why; odometry must be there, and the vehicle stand level")
+def check_command(name: str, result: CommandResult, state: int, armed: bool) -> Check:
+    """Whether a command has had its effect: the controller's state, and that of the commands to the vehicle."""
+    status = result.status
+    good = status is not None and status.state == state and result.delay <= RESPONSE_TIME and result.armed is armed
+    sent = "none" if result.armed is None else "armed" if result.armed else "disarmed"
+    observation = "no controller/status" if status is None else (
+        f"{_STATES.get(status.state, status.state)} after {result.delay:.2f} s, commands {sent}: {status.message[:80]}")
+    return make_check(name, good, observation, "see the controller's message; odometry must be available, and the vehicle level")
 
 
-def stopped(last_command: float | None, last_motion: float | None, bound: float = STOPPED) -> Check:
+def check_watchdog(last_command: float | None, last_motion: float | None, bound: float = STOP_TIME) -> Check:
     """Whether the motors stop when commands do: when the last command came, and when a rotor last turned [s]."""
     title, advice = "watchdog", "with the props off: --watchdog, and stop the controller's process when asked"
     if last_command is None:
         return Check(title, Verdict.OPEN, "commands did not end", advice)
     if last_motion is None:
-        return Check(title, Verdict.OPEN, "nobody tells whether the motors turn (rotor_state, or `armed` in /diagnostics)",
+        return Check(title, Verdict.OPEN, "no source reports whether the motors turn (rotor_state, or `armed` in /diagnostics)",
                      "look at the motors")
-    return judged(title, last_motion - last_command <= bound,
-                  f"the motors stopped {last_motion - last_command:.2f} s after the last command",
-                  f"they must stop within {bound:g} s: fly nothing until they do")
+    return make_check(title, last_motion - last_command <= bound,
+                      f"the motors stopped {last_motion - last_command:.2f} s after the last command",
+                      f"they must stop within {bound:g} s: do not fly until they do")
 
 
-def taken_over(turned: bool, armed: bool | None) -> Check:
+def check_takeover(turned: bool, armed: bool | None) -> Check:
     """Whether the pilot's switch stops the motors though commands go on.
 
     Args:
@@ -254,7 +254,8 @@ def taken_over(turned: bool, armed: bool | None) -> Check:
     """
     title = "pilot's takeover"
     if not turned or armed is False:
-        return Check(title, Verdict.OPEN, "the commands ended" if turned else "nobody tells that the motors turn (rotor_state, or `armed` in /diagnostics)",
+        return Check(title, Verdict.OPEN, "the commands ended" if turned else
+                     "no source reports that the motors turn (rotor_state, or `armed` in /diagnostics)",
                      "with the props off: --takeover, and flip the pilot's switch when asked")
-    return judged(title, armed is True, "the motors stopped while commands went on" if armed else "the motors went on turning",
-                  "with his own arming switch off, the pilot's switch must stop them: see its channel and range (MSP OVERRIDE)")
+    return make_check(title, armed is True, "the motors stopped while commands went on" if armed else "the motors went on turning",
+                      "with his own arming switch off, the pilot's switch must stop them: check its channel and range (MSP OVERRIDE)")

@@ -22,10 +22,10 @@ EXAMPLES = """examples:
   python3 scripts/preflight.py --vehicle mine.yaml --shake down        then shake it by hand: rotation between camera and IMU
   python3 scripts/preflight.py --vehicle mine.yaml --props-off         then arm, disarm and kill: NO PROPELLERS MAY BE MOUNTED
   python3 scripts/preflight.py --vehicle mine.yaml --props-off --takeover   then wait until the pilot takes over by his switch
-  python3 scripts/preflight.py --vehicle mine.yaml --props-off --watchdog   then wait until you stop the controller, and see the motors stop
+  python3 scripts/preflight.py --vehicle mine.yaml --props-off --watchdog   then wait until you stop the controller, and check that the motors stop
 
 exit code: 0 nothing has failed, 1 something has, 2 wrong arguments"""
-PATIENCE = 60.0  # with the hands that are asked for something [s]
+USER_TIMEOUT = 60.0  # for an action by hand [s]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -43,67 +43,70 @@ def parser() -> argparse.ArgumentParser:
     return out
 
 
-def in_body(listener: Any, sensors: str) -> list[ImuSample]:
-    """The IMU samples that were heard, in the axes of B, as the nodes turn them; none where their axes are not known."""
+def imu_in_body(listener: Any, sensors: str) -> list[ImuSample]:
+    """The received IMU samples in the axes of B, rotated as by the nodes; none where their axes are not known."""
     axes = ImuAxes(lambda *_: None, sensors)
     for _, transform in listener.values["/tf_static"]:
         axes.add_transform(transform)
     return [taken for _, sample in listener.values["imu/data_raw"] if (taken := axes.in_body(sample)) is not None]
 
 
-def listened(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]:
-    """What is judged of a vehicle at rest."""
+def passive_checks(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]:
+    """Checks of a vehicle at rest."""
     values = {channel: [value for _, value in entries] for channel, entries in listener.values.items()}
     channels = [c for c in checks.RATES if not c.startswith("camera_") or c.split("/")[0].removeprefix("camera_") in vehicle.mounts]
-    found = [check for channel in channels for check in checks.stream(channel, [value.stamp for value in values[channel]])]
-    seen = {name: listener.stamped(f"camera_{name}/camera_info") for name in vehicle.mounts}
-    found += checks.clocks(listener.stamped("imu/data_raw"), seen)
-    imu = in_body(listener, sensors)
-    found += checks.frames(listener.newest("odometry"), listener.newest("imu/data_raw"), bool(imu))
-    found += checks.rest(imu)
-    found += [checks.camera_model(name, listener.newest(f"camera_{name}/camera_info"), vehicle) for name in vehicle.mounts]
-    return found + checks.extrinsics(values["/tf_static"], vehicle)
+    found = [check for channel in channels for check in checks.check_stream(channel, [value.stamp for value in values[channel]])]
+    frames = {name: listener.arrivals_and_stamps(f"camera_{name}/camera_info") for name in vehicle.mounts}
+    found += checks.check_clocks(listener.arrivals_and_stamps("imu/data_raw"), frames)
+    imu = imu_in_body(listener, sensors)
+    found += checks.check_frames(listener.newest("odometry"), listener.newest("imu/data_raw"), bool(imu))
+    found += checks.check_at_rest(imu)
+    found += [checks.check_camera_model(name, listener.newest(f"camera_{name}/camera_info"), vehicle) for name in vehicle.mounts]
+    return found + checks.check_extrinsics(values["/tf_static"], vehicle)
 
 
-def shaken(listener: Any, vehicle: Vehicle, camera: str | None, sensors: str) -> Check:
-    """The rotation between camera and IMU, told while the vehicle is shaken; without a camera it is not."""
+def rotation_check(listener: Any, vehicle: Vehicle, camera: str | None, sensors: str) -> Check:
+    """The rotation between camera and IMU, measured while the vehicle is shaken; not exercised without a camera."""
     turned = np.zeros((0, 3)), np.zeros((0, 3))
     if camera:
-        listener.watch(camera, vehicle.mounts[camera].camera)
+        listener.subscribe_camera(camera, vehicle.mounts[camera].camera)
         print("shake the vehicle about all axes for 10 s ...", flush=True)
-        listener.listen(10.0)
-        imu = in_body(listener, sensors)
+        listener.spin_for(10.0)
+        imu = imu_in_body(listener, sensors)
         turned = listener.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3),
                                        vehicle.mounts[camera].stamp_offset)
-    return checks.shaken(camera or next(iter(vehicle.mounts), ""), *turned, vehicle)
+    return checks.check_rotation(camera or next(iter(vehicle.mounts), ""), *turned, vehicle)
 
 
-def exercised(listener: Any, arguments: argparse.Namespace, bound: float = checks.STOPPED) -> list[Check]:
-    """Arming, disarming, killing, the pilot's takeover and the watchdog, where the propellers are off; `bound`: see `checks.stopped`."""
+def active_checks(listener: Any, arguments: argparse.Namespace, bound: float = checks.STOP_TIME) -> list[Check]:
+    """Arming, disarming, killing, the pilot's takeover and the watchdog, where the propellers are off.
+
+    `bound`: see `checks.check_watchdog`.
+    """
     if not arguments.props_off:
         return [Check(name, Verdict.OPEN, "the motors were not started", "take the propellers off, and add --props-off")
                 for name in ("armed state", "disarming", "kill", "pilot's takeover", "watchdog")]
-    found = [checks.obeyed("armed state", listener.order(Command.ARM, State.ARMED), State.ARMED, True),
-             checks.obeyed("disarming", listener.order(Command.DISARM, State.DISARMED), State.DISARMED, False)]
-    taken, last = (False, None), (None, None)
+    found = [checks.check_command("armed state", listener.send_command(Command.ARM, State.ARMED), State.ARMED, True),
+             checks.check_command("disarming", listener.send_command(Command.DISARM, State.DISARMED), State.DISARMED, False)]
+    takeover, watchdog = (False, None), (None, None)
     if found[0].verdict is Verdict.PASSED:
-        listener.order(Command.ARM, State.ARMED)
-        found.append(checks.obeyed("kill", listener.order(Command.KILL, State.FAILED), State.FAILED, False))
-        listener.order(Command.DISARM, State.DISARMED)
-        if arguments.takeover and listener.order(Command.ARM, State.ARMED).armed:
-            print(f"armed: pilot, your arming switch off, then take over (within {PATIENCE:g} s) ...", flush=True)
-            taken = listener.await_takeover(PATIENCE)
-            listener.order(Command.DISARM, State.DISARMED)
+        listener.send_command(Command.ARM, State.ARMED)
+        found.append(checks.check_command("kill", listener.send_command(Command.KILL, State.FAILED), State.FAILED, False))
+        listener.send_command(Command.DISARM, State.DISARMED)
+        if arguments.takeover and listener.send_command(Command.ARM, State.ARMED).armed:
+            print(f"armed: pilot, your arming switch off, then take over (within {USER_TIMEOUT:g} s) ...", flush=True)
+            takeover = listener.await_takeover(USER_TIMEOUT)
+            listener.send_command(Command.DISARM, State.DISARMED)
             print("disarmed: hand over again", flush=True)
-    if arguments.watchdog and listener.order(Command.ARM, State.ARMED).armed:
-        print(f"armed: stop the controller's process now (within {PATIENCE:g} s) ...", flush=True)
-        last = listener.await_end_of_commands(PATIENCE)
-        listener.order(Command.KILL, State.FAILED)
-    return [*found, checks.taken_over(*taken), checks.stopped(*last, bound)]
+    if arguments.watchdog and listener.send_command(Command.ARM, State.ARMED).armed:
+        print(f"armed: stop the controller's process now (within {USER_TIMEOUT:g} s) ...", flush=True)
+        watchdog = listener.await_end_of_commands(USER_TIMEOUT)
+        listener.send_command(Command.KILL, State.FAILED)
+    return [*found, checks.check_takeover(*takeover), checks.check_watchdog(*watchdog, bound)]
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    """Listen, judge, tell."""
+    """Listen, check, print."""
     if not 1.0 <= arguments.listen <= 300.0:
         raise PerchError(f"--listen: {arguments.listen:g} is outside [1, 300] s")
     vehicle = load_vehicle(arguments.vehicle)
@@ -114,9 +117,9 @@ def _check(arguments: argparse.Namespace) -> int:
     with closing(GraphListener(vehicle, arguments.namespace)) as listener:
         print(f"listening for {arguments.listen:g} s: the vehicle must stand still on its feet ...", flush=True)
         listener.await_first("imu/data_raw", arguments.listen)
-        listener.listen(arguments.listen)
-        found = [*listened(listener, vehicle, arguments.sensors), shaken(listener, vehicle, arguments.shake, arguments.sensors),
-                 *exercised(listener, arguments, checks.STOPPED if vehicle.actuation.type == "rotor_speeds" else checks.DESCENDED)]
+        listener.spin_for(arguments.listen)
+        found = [*passive_checks(listener, vehicle, arguments.sensors), rotation_check(listener, vehicle, arguments.shake, arguments.sensors),
+                 *active_checks(listener, arguments, checks.STOP_TIME if vehicle.actuation.type == "rotor_speeds" else checks.DESCENT_TIME)]
     print("\n".join(map(str, found)))
     counts = {verdict: sum(check.verdict is verdict for check in found) for verdict in Verdict}
     print(", ".join(f"{count} {verdict.value}" for verdict, count in counts.items()))

@@ -14,8 +14,8 @@ from perch_core.values import ImuSample
 from perch_eval.recordings.calibration import from_asl
 from perch_eval.recordings.recording import IMU, Event, Recording, RecordingError, picture
 
-AFTER = 1_000_000_000  # what the IMU says later than this after the last image is left out [ns]
-TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
+IMU_TAIL = 1_000_000_000  # IMU samples later than this after the last image are left out [ns]
+GROUND_TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
 
 
 def root_of(path: Path) -> Path | None:
@@ -56,17 +56,17 @@ class AslRecording(Recording):
         self._stamps, self._imu = np.empty(0, np.int64), np.empty((0, 6))
         if imu.is_file():
             self._stamps, self._imu = table(imu, 7)
-        self.samples = int((self._stamps <= self._frames[-1][0] + AFTER).sum())
+        self.samples = int((self._stamps <= self._frames[-1][0] + IMU_TAIL).sum())
 
     @property
     def truth(self) -> Path | None:
         """The motion capture's file."""
-        files = (self._root / name / "data.csv" for name in TRUTHS)
+        files = (self._root / name / "data.csv" for name in GROUND_TRUTH_FOLDERS)
         return next((file for file in files if file.is_file() and file.stat().st_size > 1000), None)
 
     def events(self) -> Iterator[Event]:
         """In the order of the stamps, until a little after the last image; an IMU sample comes before an image of the same stamp."""
-        cameras, last = self.sensors.cameras if self.sensors is not None else {}, self._frames[-1][0] + AFTER
+        cameras, last = self.sensors.cameras if self.sensors is not None else {}, self._frames[-1][0] + IMU_TAIL
         samples = takewhile(lambda event: event.arrived <= last, map(self._sample, range(len(self._stamps))))
         frames = (Event(name, stamp, picture(path, stamp, name, cameras.get(name))) for stamp, name, path in self._frames)
         yield from merge(samples, frames, key=lambda event: event.arrived)

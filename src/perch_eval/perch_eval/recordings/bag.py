@@ -14,7 +14,7 @@ from perch_core.ros.messages.sensing import compressed_value, image_value, imu_v
 from perch_core.sensors import Sensors
 from perch_core.values import CameraImage, ImuSample
 from perch_eval.extras import require
-from perch_eval.mcap_log import broke_off, make_whole
+from perch_eval.mcap_log import is_truncated, recover
 from perch_eval.recordings.recording import IMU, Event, Recording, RecordingError
 
 IMAGES = {"sensor_msgs/msg/Image": image_value, "sensor_msgs/msg/CompressedImage": compressed_value}
@@ -31,7 +31,7 @@ def is_bag(path: Path) -> bool:
 class BagRecording(Recording):
     """A bag. A camera is the topic that the sensor file names, or `camera_<name>/image_raw` (or `/compressed` below it).
 
-    An `.mcap` that broke off is read as far as it goes, from a copy that has an index.
+    An `.mcap` that is cut off is read as far as it goes, from a copy that has an index.
     """
     def __init__(self, path: Path, sensors: Sensors | None) -> None:
         """
@@ -39,20 +39,20 @@ class BagRecording(Recording):
             RecordingError: it cannot be read, or has none of the topics.
         """
         super().__init__(path, sensors)
-        self._readable, self._broke_off = path, ""
-        if path.is_file() and path.suffix == ".mcap" and broke_off(path):
+        self._readable, self._truncation = path, ""
+        if path.is_file() and path.suffix == ".mcap" and is_truncated(path):
             self._copy = tempfile.TemporaryDirectory(prefix="perch_recording_")  # goes with this recording
             self._readable = Path(self._copy.name) / path.name
-            self._broke_off = self.damage = make_whole(path, self._readable)
+            self._truncation = self.damage = recover(path, self._readable)
         with self._open() as reader:
             kinds = {c.topic: c.msgtype for c in reader.connections}
             self._counts = counts = {topic: info.msgcount for topic, info in reader.topics.items()}
-        if self._broke_off and not counts:
-            raise RecordingError(f"{path}: cannot be read: {self._broke_off}")
+        if self._truncation and not counts:
+            raise RecordingError(f"{path}: cannot be read: {self._truncation}")
         pictures = {topic for topic, kind in kinds.items() if kind in IMAGES}
         imus = sorted(topic for topic, kind in kinds.items() if kind == IMU_TYPE)
         if sensors is None:
-            self._cameras = {_camera_of(topic): topic for topic in sorted(pictures)}
+            self._cameras = {_camera_name(topic): topic for topic in sorted(pictures)}
             self._imu = imus[0] if imus else ""
         else:
             found = {name: _topic(camera.topic or f"camera_{name}/image_raw", pictures) for name, camera in sensors.cameras.items()}
@@ -60,20 +60,20 @@ class BagRecording(Recording):
             if not self._cameras:
                 raise RecordingError(
                     f"{path}: none of the cameras' topics of {sensors.name}; images are on: {', '.join(sorted(pictures)) or 'none'}")
-            wanted = sensors.imu.topic or "imu/data_raw" if sensors.imu is not None else ""
-            self._imu = _topic(wanted, set(imus)) if wanted else ""
-            if wanted and not self._imu:
-                raise RecordingError(f"{path}: no IMU on {wanted}; there are: {', '.join(imus) or 'none'}")
+            requested = sensors.imu.topic or "imu/data_raw" if sensors.imu is not None else ""
+            self._imu = _topic(requested, set(imus)) if requested else ""
+            if requested and not self._imu:
+                raise RecordingError(f"{path}: no IMU on {requested}; there are: {', '.join(imus) or 'none'}")
         self.images = {name: counts[topic] for name, topic in self._cameras.items()}
         self.samples = counts[self._imu] if self._imu else 0
 
     def events(self) -> Iterator[Event]:
-        """In the order in which they were recorded. Images that cannot be used are left out and said in `damage`."""
+        """In the order in which they were recorded. Images that cannot be used are left out and counted in `damage`."""
         sources = {topic: name for name, topic in self._cameras.items()}
         if self._imu:
             sources[self._imu] = IMU
         unusable: Counter[tuple[str, str]] = Counter()
-        self.damage = self._broke_off
+        self.damage = self._truncation
         with self._open() as reader:
             messages = reader.messages([c for c in reader.connections if c.topic in sources])
             while True:
@@ -89,8 +89,8 @@ class BagRecording(Recording):
                     self.damage = f"{type(error).__name__}: {error}"
                     break
                 yield Event(sources[connection.topic], arrived, value)
-        words = [f"{n} of {self._counts[topic]} messages of {topic} cannot be used: {error}" for (topic, error), n in unusable.most_common(1)]
-        self.damage = "; ".join(filter(None, [*words, self.damage]))
+        texts = [f"{n} of {self._counts[topic]} messages of {topic} cannot be used: {error}" for (topic, error), n in unusable.most_common(1)]
+        self.damage = "; ".join(filter(None, [*texts, self.damage]))
 
     def poses(self, topic: str) -> list[tuple[Any, ...]]:
         """(stamp [ns], x, y, z [m], qx, qy, qz, qw) of each message of a topic.
@@ -153,15 +153,15 @@ def _numbers(pose: Any) -> tuple[float, ...]:
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
-def _topic(wanted: str, there: set[str]) -> str:
-    """The topic that is wanted, with or without slash, namespace and `/compressed`; empty: none."""
-    end = "/" + wanted.lstrip("/")
+def _topic(requested: str, available: set[str]) -> str:
+    """The topic that is requested, with or without slash, namespace and `/compressed`; empty: none."""
+    end = "/" + requested.lstrip("/")
     names = (end, f"{end}/compressed")
-    exact = [topic for topic in names if topic in there]
-    return (exact or [topic for topic in sorted(there) if topic.endswith(names)] or [""])[0]
+    exact = [topic for topic in names if topic in available]
+    return (exact or [topic for topic in sorted(available) if topic.endswith(names)] or [""])[0]
 
 
-def _camera_of(topic: str) -> str:
+def _camera_name(topic: str) -> str:
     """A name for the camera of a topic: `down` of camera_down/image_raw; else its whole name."""
     first = topic.strip("/").removesuffix("/compressed").removesuffix("/image_raw")
     return first.rpartition("camera_")[2].replace("/", "_") or "camera"

@@ -17,7 +17,7 @@ from perch_core.yaml_text import parse_yaml
 
 MODELS = {"radtan": "radtan", "radial-tangential": "radtan", "plumb_bob": "radtan", "equidistant": "equidistant",
           "none": "pinhole", "": "pinhole"}
-RIGID = 1e-3  # by how much a rotation in a file may miss being one
+ROTATION_TOLERANCE = 1e-3  # of a rotation matrix in a file
 IMU_KEYS = {"accel_noise_density": "accelerometer_noise_density", "gyro_noise_density": "gyroscope_noise_density",
             "accel_bias_walk": "accelerometer_random_walk", "gyro_bias_walk": "gyroscope_random_walk"}
 
@@ -60,7 +60,7 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
         out["imu"] = _imu(str(imu), _mapping(imu), R_BI)
     for file in sorted(root.glob("cam*/sensor.yaml")):
         c, source = _mapping(file), str(file)
-        T_IC = np.linalg.inv(T_BI) @ _transform(source, "T_BS", _needed(source, c, "T_BS"))
+        T_IC = np.linalg.inv(T_BI) @ _transform(source, "T_BS", _required(source, c, "T_BS"))
         camera = _camera(source, "", c, c.get("distortion_coefficients", []), T_IC, R_BI)
         out["cameras"][file.parent.name] = camera | {"rate": c.get("rate_hz", 20)}
     return config.from_mapping(Sensors, out, str(root))
@@ -114,7 +114,7 @@ def _camera(source: str, dot: str, c: dict[str, Any], distortion: Any, T_IC: np.
     model = str(c.get("distortion_model", ""))
     if model not in MODELS:
         raise ConfigError(source, f"{dot}distortion_model", f"{model!r} is not one of {', '.join(filter(None, MODELS))}")
-    intrinsics, resolution = (_needed(source, c, key, dot) for key in ("intrinsics", "resolution"))
+    intrinsics, resolution = (_required(source, c, key, dot) for key in ("intrinsics", "resolution"))
     for key, value, n in (("intrinsics", intrinsics, 4), ("resolution", resolution, 2)):
         if not isinstance(value, list) or len(value) != n:
             raise ConfigError(source, f"{dot}{key}", f"{value!r} is not {n} numbers")
@@ -127,7 +127,7 @@ def _camera(source: str, dot: str, c: dict[str, Any], distortion: Any, T_IC: np.
 def _imu(source: str, c: Any, R_BI: np.ndarray) -> dict[str, Any]:
     if not isinstance(c, dict):
         raise ConfigError(source, "", "is no mapping")
-    out: dict[str, Any] = {ours: _number(source, theirs, _needed(source, c, theirs)) for ours, theirs in IMU_KEYS.items()}
+    out: dict[str, Any] = {ours: _number(source, theirs, _required(source, c, theirs)) for ours, theirs in IMU_KEYS.items()}
     return out | {"rate": _number(source, "update_rate", c.get("update_rate", c.get("rate_hz"))),
                   "orientation": so3.quat_from_matrix(R_BI).tolist(), "topic": str(c.get("rostopic", ""))}
 
@@ -145,7 +145,7 @@ def _mapping(path: Path) -> dict[str, Any]:
     return content
 
 
-def _needed(source: str, c: dict[str, Any], key: str, dot: str = "") -> Any:
+def _required(source: str, c: dict[str, Any], key: str, dot: str = "") -> Any:
     if key not in c:
         raise ConfigError(source, f"{dot}{key}", "missing")
     return c[key]
@@ -164,7 +164,7 @@ def _transform(source: str, key: str, value: Any) -> np.ndarray:
     except (KeyError, TypeError, ValueError):
         raise ConfigError(source, key, "is not 4 x 4 numbers") from None
     R = T[:3, :3]
-    rotation = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() <= RIGID and np.linalg.det(R) >= 0.0
+    rotation = np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(R) >= 0.0
     if not rotation or not np.allclose(T[3], [0, 0, 0, 1]):
         raise ConfigError(source, key, f"{np.round(T, 4).tolist()} is no rigid transform")
     T[:3, :3] = so3.nearest(R)

@@ -12,39 +12,39 @@ from perch_core.sensors import Sensors
 from perch_core.values import CameraImage
 from perch_eval.camera_turns import CameraTurns
 from perch_eval.flight import interpolated
-from perch_eval.recordings.findings import Report, check_rhythm
+from perch_eval.recordings.findings import Report, check_rate
 from perch_eval.recordings.recording import Recording
 from perch_perception.images import ImageError, image_array
 
-LOOKED_AT = 60  # images of each camera whose pixels are looked at
-CORRELATED = 5.0  # frames over which errors of an image's turn go together
-SPAN = 8.0  # of the stretch that is looked at [s]
+SAMPLED_IMAGES = 60  # images of each camera whose pixels are evaluated
+CORRELATED = 5.0  # frames over which errors of an image's rotation are correlated
+SPAN = 8.0  # of the interval that is evaluated [s]
 OFFSETS = np.arange(-0.5, 0.501, 0.002)  # of the images' stamps that are tried [s]
-TURNED = 0.2  # 1 sigma of rates that tell something [rad/s]
-ALIKE, UNLIKE = 0.25, 0.7  # what images and gyro may not share of a turn, as a share: below, its axis can be told; above, it is another turn
+MIN_RATE_SIGMA = 0.2  # least 1 sigma of usable rates [rad/s]
+MATCHING, MISMATCHING = 0.25, 0.7  # share of the images' rotation that the gyro does not explain: below, they match, above, they do not
 
 
-class Looker:
-    """What is kept of a camera's images."""
+class ImageStatistics:
+    """Stamps, delays and sizes of a camera's images, and what `measure_image` returns for some of them."""
     def __init__(self, total: int) -> None:
         self.stamps: list[int] = []
         self.delays: list[int] = []
         self.sizes: set[tuple[int, int]] = set()
-        self.looks: list[tuple[float, ...]] = []
-        self._every = max(1, total // LOOKED_AT)
+        self.samples: list[tuple[float, ...]] = []
+        self._every = max(1, total // SAMPLED_IMAGES)
 
-    def take(self, image: CameraImage, arrived: int) -> None:
+    def add(self, image: CameraImage, arrived: int) -> None:
         """An image, and when it was recorded [ns]."""
         if len(self.stamps) % self._every == 0:
             pixels = image.pixels()
             if pixels is not None:
                 self.sizes.add((pixels.shape[1], pixels.shape[0]))
-                self.looks.append(look_at(pixels))
+                self.samples.append(measure_image(pixels))
         self.stamps.append(image.stamp)
         self.delays.append(arrived - image.stamp)
 
 
-def look_at(pixels: np.ndarray) -> tuple[float, ...]:
+def measure_image(pixels: np.ndarray) -> tuple[float, ...]:
     """Brightness, share of saturated pixels, width of its sharper edges [px], number of corners of an image uint8 (h, w) or (h, w, 3).
 
     The width of an edge is its step, over three pixels to either side, by its steepest slope; the median of the image's steepest.
@@ -59,57 +59,57 @@ def look_at(pixels: np.ndarray) -> tuple[float, ...]:
     return float(grey.mean()), float((grey >= 250).mean()), width, float(0 if corners is None else len(corners))
 
 
-def check_camera(report: Report, name: str, looker: Looker, imu_stamps: np.ndarray, sensors: Sensors | None) -> None:
+def check_camera(report: Report, name: str, statistics: ImageStatistics, imu_stamps: np.ndarray, sensors: Sensors | None) -> None:
     sensor = sensors.cameras.get(name) if sensors else None
-    stamps, about = np.array(looker.stamps, np.int64), f"camera {name}"
+    stamps, about = np.array(statistics.stamps, np.int64), f"camera {name}"
     if len(stamps) == 0:
-        report.say(about, "no image", fails=True)
+        report.add(about, "no image", fails=True)
         return
-    if sensor is not None and looker.sizes - {(sensor.width, sensor.height)}:
-        sizes = ", ".join(f"{w} x {h}" for w, h in sorted(looker.sizes))
-        report.say(about, f"images of {sizes} px, the calibration is of {sensor.width} x {sensor.height}", fails=True)
-    if not looker.looks:
-        report.say(about, "no image could be decoded", fails=True)
+    if sensor is not None and statistics.sizes - {(sensor.width, sensor.height)}:
+        sizes = ", ".join(f"{w} x {h}" for w, h in sorted(statistics.sizes))
+        report.add(about, f"images of {sizes} px, the calibration is of {sensor.width} x {sensor.height}", fails=True)
+    if not statistics.samples:
+        report.add(about, "no image could be decoded", fails=True)
         return
     if len(imu_stamps):
         if not (np.diff(stamps) > 0).all():
-            report.say(f"{about} stamps", f"{int((np.diff(stamps) <= 0).sum())} are not newer than the one before", warning=True)
+            report.add(f"{about} stamps", f"{int((np.diff(stamps) <= 0).sum())} are not newer than the one before", warning=True)
         different = np.unique(stamps)
         if len(different) > 2:
-            check_rhythm(report, about, different, least=5.0, wanted=10.0, told=None)
+            check_rate(report, about, different, minimum=5.0, recommended=10.0, nominal=None)
         elif len(stamps) > 2:
-            report.say(f"{about} stamps", "all are the same: the driver does not stamp", fails=True)
+            report.add(f"{about} stamps", "all are the same: the driver does not stamp", fails=True)
         outside = float(((stamps < imu_stamps[0]) | (stamps > imu_stamps[-1])).mean())
         if outside > 0.02:
             gap = 1e-9 * max(imu_stamps[0] - stamps[0], stamps[-1] - imu_stamps[-1])
-            report.say(f"{about} clock", f"{100 * outside:.0f} % of the images lie outside the IMU's time, by up to {gap:.3f} s",
+            report.add(f"{about} clock", f"{100 * outside:.0f} % of the images lie outside the IMU's time, by up to {gap:.3f} s",
                        warning=outside < 0.5, fails=outside >= 0.5)
-        delays = 1e-9 * np.array(looker.delays)
+        delays = 1e-9 * np.array(statistics.delays)
         if np.any(delays != 0.0):
             median, p99 = float(np.median(delays)), float(np.percentile(delays, 99))
-            report.say(f"{about} delay", f"recorded {1e3 * median:.0f} ms after the stamp (median; 99 % within {1e3 * p99:.0f} ms)",
+            report.add(f"{about} delay", f"recorded {1e3 * median:.0f} ms after the stamp (median; 99 % within {1e3 * p99:.0f} ms)",
                        warning=median < -1e-3 or p99 > 0.5)
-    brightness, bright, width, corners = (np.array(column) for column in zip(*looker.looks))
+    brightness, bright, width, corners = (np.array(column) for column in zip(*statistics.samples))
     report.figures[f"{name}_corners"] = float(np.median(corners))
-    report.say(f"{about} exposure",
+    report.add(f"{about} exposure",
                f"mean brightness {np.median(brightness):.0f} of 255, {100 * np.median(bright):.1f} % of the pixels saturated",
                warning=bool(np.median(brightness) < 25 or np.median(bright) > 0.2), fails=bool(np.median(brightness) < 5))
     if np.isfinite(width).any():
         worst, blurred = float(np.nanpercentile(width, 90)), float(np.nanmedian(width))
         report.figures[f"{name}_edge_px"] = blurred
         why = ": out of focus, or moved while exposed" if blurred > 6.0 else ""
-        report.say(f"{about} sharpness",
+        report.add(f"{about} sharpness",
                    f"edges are {blurred:.1f} px wide in the median, {worst:.1f} px in the worst tenth of the images{why}",
                    warning=blurred > 6.0)
     few = float((corners < 30).mean())
-    report.say(f"{about} texture",
+    report.add(f"{about} texture",
                f"{np.median(corners):.0f} corners in the median" + (f"; under 30 in {100 * few:.0f} % of the images" if few else ""),
                warning=few > 0.1, fails=few > 0.8)
 
 
 def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: np.ndarray, sensors: Sensors, R_BI: np.ndarray) -> None:
     """Time offset and rotation between each camera and the IMU, by which the turns that both see fit best."""
-    begin = _liveliest(stamps, imu[:, :3])
+    begin = _most_dynamic_interval(stamps, imu[:, :3])
     end = begin + round(SPAN * 1e9)
     turns = {name: CameraTurns(sensors.cameras[name].camera) for name in recording.images if name in sensors.cameras}
     for event in recording.events():
@@ -118,47 +118,47 @@ def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: 
             continue
         with suppress(ImageError):
             turns[event.source].add(image.stamp, image_array(image, sensors.cameras[event.source].camera))
-    for name, seen in turns.items():
-        if len(seen.spans) < 20:
+    for name, found in turns.items():
+        if len(found.spans) < 20:
             continue
-        rows = np.array([(1e-9 * (before - stamps[0]), 1e-9 * (after - stamps[0]), *rate) for before, after, rate in seen.spans])
+        rows = np.array([(1e-9 * (before - stamps[0]), 1e-9 * (after - stamps[0]), *rate) for before, after, rate in found.spans])
         R_CI = sensors.mounts[name].R_BC.T @ R_BI
         _check_clock(report, name, rows, 1e-9 * (stamps - stamps[0]), imu[:, :3] @ R_CI.T, sensors.cameras[name].stamp_offset)
 
 
-def _check_clock(report: Report, name: str, turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray, told: float) -> None:
-    """Mounting and clock of one camera; `told` is the offset of the sensor file [s], the others are those of `felt_rates`."""
-    rate, felt = turns[:, 2:], felt_rates(turns, stamps, gyro_C)
-    R, unlike = mounting(rate, felt)
-    if unlike < ALIKE:
-        felt, angle = felt @ R, float(np.degrees(np.linalg.norm(so3.log(R))))
-        report.say(f"camera {name} mounting", f"{angle:.1f} deg from the sensor file by the turns that both see", fails=angle > 10.0)
-    offset, sigma = clock_offset(rate, felt, 0.5 * (turns[:, 0] + turns[:, 1]))
+def _check_clock(report: Report, name: str, turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray, nominal: float) -> None:
+    """Mounting and clock of one camera; `nominal` is the offset of the sensor file [s], the others are those of `gyro_rates`."""
+    rate, gyro_rate = turns[:, 2:], gyro_rates(turns, stamps, gyro_C)
+    R, mismatch = mounting(rate, gyro_rate)
+    if mismatch < MATCHING:
+        gyro_rate, angle = gyro_rate @ R, float(np.degrees(np.linalg.norm(so3.log(R))))
+        report.add(f"camera {name} mounting", f"{angle:.1f} deg from the sensor file, by the rotation of camera and gyro", fails=angle > 10.0)
+    offset, sigma = clock_offset(rate, gyro_rate, 0.5 * (turns[:, 0] + turns[:, 1]))
     if sigma > 0.01:
-        turned = felt.std(axis=1).mean(axis=0)
-        share = ((rate - felt).std(axis=1) / felt.std(axis=1)).min(axis=0)
-        if (turned > TURNED).any() and share[turned > TURNED].min() > UNLIKE:
-            report.say(f"camera {name} clock", f"the gyro turns, but the images do not turn so at any offset up to {OFFSETS[-1]:g} s: "
-                       "clock, axes or unit are wrong, or what is seen moves", warning=True, fails=bool(turned[2] > TURNED))
+        spread = gyro_rate.std(axis=1).mean(axis=0)
+        share = ((rate - gyro_rate).std(axis=1) / gyro_rate.std(axis=1)).min(axis=0)
+        if (spread > MIN_RATE_SIGMA).any() and share[spread > MIN_RATE_SIGMA].min() > MISMATCHING:
+            report.add(f"camera {name} clock", f"the rotation of the images does not match the gyro's at any offset up to {OFFSETS[-1]:g} s: "
+                       "clock, axes or unit are wrong, or the scene moves", warning=True, fails=bool(spread[2] > MIN_RATE_SIGMA))
         else:
-            report.say(f"camera {name} clock", f"turns are too slow to compare it with the IMU's ({1e3 * sigma:.0f} ms, 1 sigma)")
+            report.add(f"camera {name} clock", f"rotation is too slow to compare it with the IMU's ({1e3 * sigma:.0f} ms, 1 sigma)")
         return
     report.figures[f"{name}_stamp_offset_s"] = offset
-    beyond, edge = abs(offset - told) - 3.0 * sigma, abs(offset) > OFFSETS[-2]
-    report.say(f"camera {name} clock",
-               f"stamps are {'more than ' if edge else ''}{1e3 * offset:+.0f} ms ({1e3 * sigma:.0f} ms, 1 sigma) from the IMU's clock by "
-               f"the turns that both see, {1e3 * told:+.0f} ms in the sensor file",
+    beyond, edge = abs(offset - nominal) - 3.0 * sigma, abs(offset) > OFFSETS[-2]
+    report.add(f"camera {name} clock",
+               f"stamps are {'more than ' if edge else ''}{1e3 * offset:+.0f} ms ({1e3 * sigma:.0f} ms, 1 sigma) from the IMU's clock, by "
+               f"the rotation of both, {1e3 * nominal:+.0f} ms in the sensor file",
                warning=beyond > 0.005, fails=edge or beyond > 0.02)
 
 
-def _liveliest(stamps: np.ndarray, gyro: np.ndarray) -> int:
+def _most_dynamic_interval(stamps: np.ndarray, gyro: np.ndarray) -> int:
     """Where the stretch of `SPAN` with the most varied turns begins [ns]."""
     edges = np.arange(stamps[0], max(stamps[-1] - round(SPAN * 1e9), stamps[0] + 1), 1_000_000_000)
     spans = [gyro[slice(*np.searchsorted(stamps, [edge, edge + round(SPAN * 1e9)]))] for edge in edges]
     return int(edges[int(np.argmax([np.linalg.norm(span - span.mean(axis=0), axis=1).mean() for span in spans]))])
 
 
-def felt_rates(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> np.ndarray:
+def gyro_rates(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> np.ndarray:
     """Mean rates of the gyro between the images' stamps, for each of `OFFSETS` by which these may be late.
 
     Args:
@@ -174,31 +174,31 @@ def felt_rates(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> np.
     return (end - begin) / (turns[:, 1] - turns[:, 0])[:, None]
 
 
-def mounting(rate: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray, float]:
+def mounting(rate: np.ndarray, gyro_rate: np.ndarray) -> tuple[np.ndarray, float]:
     """Rotation that best turns the camera's rates into the gyro's, at the best offset, and the share of the rates that it does not explain.
 
     The share is infinite where they turn about one axis only. For the arguments see `clock_offset`.
     """
-    rate, felt = rate - rate.mean(axis=0), felt - felt.mean(axis=1, keepdims=True)
+    rate, gyro_rate = rate - rate.mean(axis=0), gyro_rate - gyro_rate.mean(axis=1, keepdims=True)
     size = np.linalg.svd(rate, compute_uv=False)
-    if size[1] < TURNED * np.sqrt(len(rate)):
+    if size[1] < MIN_RATE_SIGMA * np.sqrt(len(rate)):
         return np.eye(3), np.inf
-    found = [(R := so3.nearest(one.T @ rate), float(np.linalg.norm(one - rate @ R.T) / np.linalg.norm(rate))) for one in felt]
+    found = [(R := so3.nearest(one.T @ rate), float(np.linalg.norm(one - rate @ R.T) / np.linalg.norm(rate))) for one in gyro_rate]
     return min(found, key=lambda pair: pair[1])
 
 
-def clock_offset(rate: np.ndarray, felt: np.ndarray, times: np.ndarray) -> tuple[float, float]:
+def clock_offset(rate: np.ndarray, gyro_rate: np.ndarray, times: np.ndarray) -> tuple[float, float]:
     """By how much the images' stamps are late against the gyro's, and how alike the turns are then.
 
     Args:
         rate: of the camera [rad/s], shape (n, 3).
-        felt: of the gyro at each offset, as `felt_rates` gives them, shape (k, n, 3).
+        gyro_rate: of the gyro at each offset, as `gyro_rates` gives them, shape (k, n, 3).
         times: of the rates [s], shape (n,).
 
     Returns:
         Stamp minus IMU time [s], by the axis where the rates are most alike, and its 1 sigma: the rates' difference over their slope.
     """
-    slope = np.abs(np.gradient(felt, times, axis=1)).mean(axis=1)
-    sigma = (rate - felt).std(axis=1) / np.maximum(slope, 1e-9) / np.sqrt(len(rate) / CORRELATED)
+    slope = np.abs(np.gradient(gyro_rate, times, axis=1)).mean(axis=1)
+    sigma = (rate - gyro_rate).std(axis=1) / np.maximum(slope, 1e-9) / np.sqrt(len(rate) / CORRELATED)
     k, axis = np.unravel_index(np.argmin(sigma), sigma.shape)
     return float(OFFSETS[k]), float(sigma[k, axis])

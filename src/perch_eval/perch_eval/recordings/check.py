@@ -1,4 +1,4 @@
-"""What would make perception fail on a recording, said before it fails: rates, gaps, jitter, units, noise, exposure, blur, clocks."""
+"""Checks a recording for what would make perception fail: rates, gaps, jitter, units, noise, exposure, blur, clocks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from perch_core.values import ImuSample
-from perch_eval.recordings.camera_check import Looker, check_camera, check_clocks
+from perch_eval.recordings.camera_check import ImageStatistics, check_camera, check_clocks
 from perch_eval.recordings.findings import Report
 from perch_eval.recordings.imu_check import check_imu
 from perch_eval.recordings.recording import Event, Recording
@@ -20,36 +20,36 @@ def check(recording: Recording, events: Iterator[Event] | None = None) -> Report
 
     Args:
         recording: what is judged, against its sensor file where it has one.
-        events: the recording's, where somebody counts them on their way.
+        events: of the recording, if they are counted on their way.
     """
     report, sensors = Report(), recording.sensors
     stamps, samples = [], []
-    lookers = {name: Looker(n) for name, n in recording.images.items()}
+    cameras = {name: ImageStatistics(n) for name, n in recording.images.items()}
     for event in events or recording.events():
         if isinstance(event.value, ImuSample):
             stamps.append(event.value.stamp)
             samples.append((*event.value.w_B, *event.value.f_B))
         else:
-            lookers[event.source].take(event.value, event.arrived)
+            cameras[event.source].add(event.value, event.arrived)
     if recording.damage:
-        report.say("recording", recording.damage, warning=True)
+        report.add("recording", recording.damage, warning=True)
     if not stamps:
-        report.say("imu", "there is no IMU: only single images can be looked at", warning=True)
+        report.add("imu", "there is no IMU: only single images can be evaluated", warning=True)
     imu = np.array(samples).reshape(-1, 6)
     times = np.array(stamps, np.int64)
     if len(times):
         near = np.abs(times - np.median(times)) < DAY
         if not near.all():
-            report.say("imu stamps", f"{int((~near).sum())} are more than a day from the others", warning=True)
+            report.add("imu stamps", f"{int((~near).sum())} are more than a day from the others", warning=True)
             imu, times = imu[near], times[near]
     if len(times) > 10:
         check_imu(report, times, imu, sensors.imu if sensors else None)
     elif len(times):
-        report.say("imu", f"{len(times)} samples are nothing to go by", fails=True)
-    for name, looker in lookers.items():
-        check_camera(report, name, looker, times, sensors)
+        report.add("imu", f"{len(times)} samples are too few", fails=True)
+    for name, statistics in cameras.items():
+        check_camera(report, name, statistics, times, sensors)
     if sensors is None:
-        report.say("calibration", "none: give --sensors FILE, made by `sensors.py import`", warning=True)
+        report.add("calibration", "none: give --sensors FILE, made by `sensors.py import`", warning=True)
     elif len(times) > 10 and np.ptp(times) > 0 and sensors.imu is not None:
         check_clocks(report, recording, times, imu, sensors, sensors.imu.R_BI)
     return report

@@ -13,7 +13,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.errors import ConfigError, PerchError
 from perch_core.json_values import write_json
-from perch_core.processes import one_thread_for_sums
+from perch_core.processes import single_threaded_blas
 from perch_core.sensors import Sensors, load_sensors
 from perch_core.tag_board import load_board
 from perch_core.values import CameraImage, InertialState, OdometryState
@@ -25,9 +25,9 @@ from perch_eval.recordings.evaluation import Evaluation, evaluate
 from perch_eval.recordings.drawing import Gallery
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.perception import Perception
-from perch_eval.recordings.pictures_seen import drawn, guessed_mount, look
+from perch_eval.recordings.image_detections import detect, draw_detections, guessed_mount
 from perch_eval.recordings.recording import Recording, RecordingError
-from perch_eval.recordings.report import Told, bias_figure, error_figure, frames_figure, path_figure
+from perch_eval.recordings.report import ReportContent, bias_figure, error_figure, frames_figure, path_figure
 from perch_eval.recordings.trajectory import Trajectory, read_truth, write_tum
 from perch_perception.images import ImageError
 from perch_perception.line_mapping import LineDetectionConfig
@@ -42,7 +42,7 @@ EXAMPLES = """examples:
   python3 scripts/perceive.py V1_01_easy --out out/few -p vio.filter.clones:=8
 
 writes report.html, report.json, vio.tum, estimator.tum, target.tum, truth.tum, powerlines.json; of images detections.json
-exit code: 0 done, 1 VIO never gave a pose (or no image could be looked at), 2 the caller's mistake, 130 interrupted"""
+exit code: 0 done, 1 VIO never estimated a pose (or no image could be read), 2 invalid input, 130 interrupted"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -65,7 +65,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _perceive(args: argparse.Namespace) -> int:
-    one_thread_for_sums()
+    single_threaded_blas()
     overrides = parse_overrides(args.parameter)
     for node in overrides:
         if node not in NODES:
@@ -80,20 +80,20 @@ def _perceive(args: argparse.Namespace) -> int:
     if recording.samples == 0 or sensors is None or sensors.imu is None:
         if recording.samples and sensors is None:
             raise PerchError(f"{args.recording}: has an IMU and no calibration: give --sensors FILE, made by `scripts/sensors.py import`")
-        return _look_at_pictures(args, recording)
-    if truth is not None:  # it is told of the IMU's axes, as EuRoC's is
+        return _detect_in_images(args, recording)
+    if truth is not None:  # it is that of the IMU's axes, as EuRoC's is
         truth = truth.turned(so3.quat_from_matrix(sensors.imu.R_BI.T))
     return _run(args, recording, sensors, truth, overrides)
 
 
 def _choose(sensors: Sensors, recording: Recording, given: str | None, preferred: str, option: str) -> str:
     """A camera: the one that is given, else one with the usual name, else the first."""
-    there = [name for name in sensors.cameras if recording.images.get(name)]
-    if not there:
+    available = [name for name in sensors.cameras if recording.images.get(name)]
+    if not available:
         raise PerchError(f"{recording.path}: there is no image")
-    if given is not None and given not in there:
-        raise ConfigError(option, given, f"is not one of {', '.join(there)}")
-    return given or (preferred if preferred in there else there[0])
+    if given is not None and given not in available:
+        raise ConfigError(option, given, f"is not one of {', '.join(available)}")
+    return given or (preferred if preferred in available else available[0])
 
 
 # -- recordings with an IMU ------------------------------------------------------------------------------------------
@@ -107,93 +107,93 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
     file.write_text(to_yaml(sensors, f"of {recording.path.name}"))
     perception = Perception(sensors, str(file), down, front, args.board, overrides, args.without)
     for event in recording.read():
-        perception.take(event)
+        perception.process(event)
     checked, vio = check(recording), _trajectory(perception.states)
-    told = Told({"recording": str(recording.path), "camera": down, "front": front, "images": recording.images,
-                 "imu_samples": recording.samples, "damage": recording.damage},
-                [("recording", str(recording.path.resolve())),
-                 ("sensors", f"{sensors.name}: VIO looks through {down}, the others through {front}")])
-    _tell_motion(told, perception, vio, truth)
-    _tell_surroundings(told, perception)
-    told.figures |= {"findings": [vars(f) for f in checked.findings], "sensors": checked.figures}
+    content = ReportContent({"recording": str(recording.path), "camera": down, "front": front, "images": recording.images,
+                             "imu_samples": recording.samples, "damage": recording.damage},
+                            [("recording", str(recording.path.resolve())),
+                             ("sensors", f"{sensors.name}: VIO uses camera {down}, the others use camera {front}")])
+    _add_motion(content, perception, vio, truth)
+    _add_surroundings(content, perception)
+    content.figures |= {"findings": [vars(f) for f in checked.findings], "sensors": checked.figures}
     if recording.damage:
-        told.rows.append(("damage", recording.damage))
+        content.rows.append(("damage", recording.damage))
     if perception.wires is not None:
         lines = perception.lines.lines if perception.lines is not None else ()
         write_json(args.out / "powerlines.json", [
             {"id": line.id, "start": list(line.start), "end": list(line.end), "radius": line.radius,
              "covariance": line.covariance.tolist(), "observations": line.observations} for line in lines])
-    targets = Trajectory.of((target.stamp, target.p_WS, target.q_WS) for target in perception.targets)
+    targets = Trajectory.from_poses((target.stamp, target.p_WS, target.q_WS) for target in perception.targets)
     for name, motion in (("vio", vio), ("estimator", _trajectory(perception.odometry)), ("target", targets), ("truth", truth)):
         if motion is not None:
             write_tum(args.out / f"{name}.tum", motion)
-    told.write(args.out, recording, checked.findings, perception.log)
+    content.write(args.out, recording, checked.findings, perception.log)
     return 0 if perception.states else 1
 
 
-def _tell_motion(told: Told, perception: Perception, vio: Trajectory, truth: Trajectory | None) -> None:
-    """How VIO and estimator fared."""
+def _add_motion(content: ReportContent, perception: Perception, vio: Trajectory, truth: Trajectory | None) -> None:
+    """Add the results of VIO and estimator."""
     frames, states = perception.vio.frames, perception.states
     outcomes = {name: sum(f.outcome == name for f in frames) for name in dict.fromkeys(f.outcome for f in frames)}
     cost = 1e3 * np.array([f.cost for f in frames]) if frames else np.zeros(1)
     median, p99 = float(np.median(cost)), float(np.percentile(cost, 99))
     restarts = frames[-1].restarts if frames else 0
-    told.figures |= {"frames": outcomes, "restarts": restarts, "vio_frame_ms": {"median": median, "p99": p99}}
-    told.rows += [("VIO frames", ", ".join(f"{n} {name.lower()}" for name, n in outcomes.items()) or "none"), ("restarts", str(restarts)),
+    content.figures |= {"frames": outcomes, "restarts": restarts, "vio_frame_ms": {"median": median, "p99": p99}}
+    content.rows += [("VIO frames", ", ".join(f"{n} {name.lower()}" for name, n in outcomes.items()) or "none"), ("restarts", str(restarts)),
                   ("VIO, CPU time of a frame", f"{median:.1f} ms in the median, {p99:.1f} ms p99")]
     compared = None
     if len(vio) > 1:
         moved = np.linalg.norm(vio.p - vio.p[0], axis=1)
-        told.figures["vio"] = {"path_m": vio.length, "largest_distance_m": float(moved.max()), "final_distance_m": float(moved[-1])}
-        told.rows.append(("VIO's path", f"{vio.length:.2f} m; ends {moved[-1]:.3f} m from its beginning, is at most {moved.max():.3f} m from it"))
+        content.figures["vio"] = {"path_m": vio.length, "largest_distance_m": float(moved.max()), "final_distance_m": float(moved[-1])}
+        content.rows.append(("VIO's path", f"{vio.length:.2f} m; ends {moved[-1]:.3f} m from its beginning, is at most {moved.max():.3f} m from it"))
         if truth is not None:
             try:
                 compared = evaluate(vio, truth, np.array([s.covariance[:3, :3] for s in states]))
-                told.figures["vio"] |= compared.figures
-                told.rows += _evaluation_rows("VIO", compared)
+                content.figures["vio"] |= compared.figures
+                content.rows += _evaluation_rows("VIO", compared)
                 against = evaluate(_trajectory(perception.odometry[::max(1, len(perception.odometry) // 5000)]), truth)
-                told.figures["estimator"] = against.figures
-                told.rows += _evaluation_rows("estimator", against)[:2]
+                content.figures["estimator"] = against.figures
+                content.rows += _evaluation_rows("estimator", against)[:2]
             except RecordingError as error:
-                told.rows.append(("not compared", str(error)))
-        told.plots["The path"] = path_figure(vio, compared)
+                content.rows.append(("not compared", str(error)))
+        content.plots["The path"] = path_figure(vio, compared)
         if compared is not None:
             index = {s.stamp: np.sqrt(np.diag(s.covariance)[:3]) for s in states}
-            told.plots["Error and covariance"] = error_figure(compared, np.array([index[stamp] for stamp in compared.stamps.tolist()]))
-        told.plots["Biases"] = bias_figure(perception)
+            content.plots["Error and covariance"] = error_figure(compared, np.array([index[stamp] for stamp in compared.stamps.tolist()]))
+        content.plots["Biases"] = bias_figure(perception)
     if frames:
-        told.plots["Tracks over time"] = frames_figure(frames)
-    told.pictures["Tracks"] = perception.vio.gallery.shown
+        content.plots["Tracks over time"] = frames_figure(frames)
+    content.pictures["Tracks"] = perception.vio.gallery.images
 
 
-def _tell_surroundings(told: Told, perception: Perception) -> None:
-    """What was found of board and wires."""
+def _add_surroundings(content: ReportContent, perception: Perception) -> None:
+    """Add what was found of board and wires."""
     if perception.sightings:
-        told.figures["target"], words = _board(perception)
-        told.rows.append(("board", words))
+        content.figures["target"], text = _board(perception)
+        content.rows.append(("board", text))
     if perception.lines is not None:
-        told.figures["powerlines"] = len(perception.lines.lines)
-        words = f"{len(perception.lines.lines)} segments" + (f"; {perception.lines.message}" if perception.lines.message else "")
-        told.rows.append(("powerlines", words))
+        content.figures["powerlines"] = len(perception.lines.lines)
+        text = f"{len(perception.lines.lines)} segments" + (f"; {perception.lines.message}" if perception.lines.message else "")
+        content.rows.append(("powerlines", text))
     if perception.target is not None:
-        told.pictures |= {"The board": perception.target.found.shown, "Without a board": perception.target.missed.shown[:3]}
+        content.pictures |= {"The board": perception.target.found.images, "Without a board": perception.target.missed.images[:3]}
     if perception.wires is not None:
-        told.pictures["Wires"] = perception.wires.gallery.shown
+        content.pictures["Wires"] = perception.wires.gallery.images
 
 
 def _board(perception: Perception) -> tuple[dict[str, float], str]:
-    """What is told of the board, which does not move: for JSON and in words."""
-    seen = [s for s in perception.sightings if s.pose_camera is not None]
-    figures = {"images": len(perception.sightings), "found": len(seen), "poses": len(perception.targets), "reprojection_rms_px": np.nan}
-    words = f"found in {len(seen)} of {len(perception.sightings)} images"
-    if seen:
-        figures["reprojection_rms_px"] = rms = float(np.median([s.reprojection_rms for s in seen]))
-        words += f", residual {rms:.2f} px"
+    """What was found of the board, which does not move: for JSON and as text."""
+    found = [s for s in perception.sightings if s.pose_camera is not None]
+    figures = {"images": len(perception.sightings), "found": len(found), "poses": len(perception.targets), "reprojection_rms_px": np.nan}
+    text = f"found in {len(found)} of {len(perception.sightings)} images"
+    if found:
+        figures["reprojection_rms_px"] = rms = float(np.median([s.reprojection_rms for s in found]))
+        text += f", residual {rms:.2f} px"
     p = np.array([target.p_WS for target in perception.targets]).reshape(-1, 3)
     if len(p) > 1:
         figures["spread_m"] = spread = float(np.sqrt(((p - np.median(p, axis=0))**2).sum(axis=1).mean()))
-        words += f"; its place in the map scatters by {100 * spread:.1f} cm rms"
-    return figures, words
+        text += f"; its position in the map scatters by {100 * spread:.1f} cm rms"
+    return figures, text
 
 
 def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
@@ -201,7 +201,7 @@ def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
     drift = f"{f['drift_percent']:.2f} % of the path" if np.isfinite(f["drift_percent"]) else "a path too short for a share"
     start = (f"{name}: from the start on", f"{100 * f['final_error_m']:.1f} cm off at the end ({drift}), "
              f"{100 * f['largest_error_m']:.1f} cm at most; attitude {f['attitude_rms_deg']:.2f} deg rms")
-    nees = (f"{name}: NEES of the position", f"{f['nees_position_mean']:.2f} in the mean (honest: 3)")
+    nees = (f"{name}: NEES of the position", f"{f['nees_position_mean']:.2f} in the mean (consistent: 3)")
     if not np.isfinite(f["ate_rmse_m"]):  # it stands, or moves along a line
         return [start, nees]
     attitude, why = (f", {f['ate_rmse_deg']:.2f} deg", "") if np.isfinite(f["ate_rmse_deg"]) else ("", "; too straight a path to align attitudes by")
@@ -211,14 +211,14 @@ def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
 
 
 def _trajectory(states: Sequence[InertialState] | Sequence[OdometryState]) -> Trajectory:
-    return Trajectory.of((state.stamp, state.p_WB, state.q_WB) for state in states)
+    return Trajectory.from_poses((state.stamp, state.p_WB, state.q_WB) for state in states)
 
 
 # -- images alone ----------------------------------------------------------------------------------------------------
 
 
-def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
-    board, gallery, problems, seen = load_board(args.board), Gallery(24), [], {}
+def _detect_in_images(args: argparse.Namespace, recording: Recording) -> int:
+    board, gallery, problems, detections = load_board(args.board), Gallery(24), [], {}
     for event in recording.read():
         image = event.value
         if not isinstance(image, CameraImage):
@@ -228,22 +228,22 @@ def _look_at_pictures(args: argparse.Namespace, recording: Recording) -> int:
         mount = sensor.mount(event.source) if sensor else guessed_mount(event.source, image.width, image.height)
         wires = LineDetectionConfig(appearance="red" if sensor and sensor.colour else "plain")
         try:
-            found = look(image, mount, board, wires, sensor is not None)
+            found = detect(image, mount, board, wires, sensor is not None)
         except ImageError as error:
             problems.append(f"{name}: {error}")
             continue
-        seen[name] = found.figures()
-        gallery.offer(partial(drawn, image, found, board, name))
+        detections[name] = found.figures()
+        gallery.offer(partial(draw_detections, image, found, board, name))
     problems += [recording.damage] if recording.damage else []
-    tags, poses = sum(len(s["tags"]) for s in seen.values()), sum("board" in s for s in seen.values())
+    tags, poses = sum(len(d["tags"]) for d in detections.values()), sum("board" in d for d in detections.values())
     rows = [("recording", str(recording.path.resolve())),
-            ("images", f"{len(seen)}" + ("" if recording.sensors else "; the camera is not calibrated")), ("tags", str(tags)),
-            ("board", f"posed in {poses}"), ("wires", str(sum(len(s["wires"]) for s in seen.values())))]
+            ("images", f"{len(detections)}" + ("" if recording.sensors else "; the camera is not calibrated")), ("tags", str(tags)),
+            ("board", f"posed in {poses}"), ("wires", str(sum(len(d["wires"]) for d in detections.values())))]
     rows += [("problem", problem) for problem in problems]
-    write_json(args.out / "detections.json", seen)
-    figures = {"images": len(seen), "tags": tags, "boards": poses, "problems": problems}
-    Told(figures, rows, pictures={"What was found": gallery.shown}).write(args.out, recording)
-    return 0 if seen else 1
+    write_json(args.out / "detections.json", detections)
+    figures = {"images": len(detections), "tags": tags, "boards": poses, "problems": problems}
+    ReportContent(figures, rows, pictures={"What was found": gallery.images}).write(args.out, recording)
+    return 0 if detections else 1
 
 
 main = command(parser, _perceive)

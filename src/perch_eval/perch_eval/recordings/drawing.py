@@ -39,8 +39,8 @@ def draw_tags(image: np.ndarray, tags: Sequence[tuple[int, np.ndarray]]) -> None
     """Tags by number and corners [px], shape (4, 2)."""
     for number, corners in tags:
         _line(image, corners, TAG, closed=True)
-        cv2.circle(image, _whole(corners[0]), 3, TAG, -1)
-        _text(image, str(number), _whole(corners.mean(axis=0)), TAG)
+        cv2.circle(image, _rounded(corners[0]), 3, TAG, -1)
+        _text(image, str(number), _rounded(corners.mean(axis=0)), TAG)
 
 
 def draw_wires(image: np.ndarray, camera: Camera, wires: Sequence[LineSighting]) -> None:
@@ -60,7 +60,7 @@ def _text(image: np.ndarray, text: str, place: tuple[int, int], colour: tuple[in
         cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, ink, width, cv2.LINE_AA)
 
 
-def _whole(pixel: np.ndarray) -> tuple[int, int]:
+def _rounded(pixel: np.ndarray) -> tuple[int, int]:
     return tuple(np.rint(pixel).astype(int).tolist())
 
 
@@ -69,8 +69,8 @@ def _line(image: np.ndarray, pixels: np.ndarray, colour: tuple[int, int, int], c
         cv2.polylines(image, [np.rint(16 * pixels).astype(np.int32)], closed, colour, 1, cv2.LINE_AA, 4)
 
 
-class Shown(NamedTuple):
-    """A picture.
+class GalleryImage(NamedTuple):
+    """An image of a gallery.
 
     Attributes:
         stamp: of the image [ns].
@@ -87,22 +87,22 @@ class Gallery:
     """Takes every n-th picture that is offered; when it is full, every other goes and n is doubled.
 
     Attributes:
-        shown: the pictures, in their order.
+        images: those that were taken, in their order.
     """
-    def __init__(self, most: int = 12) -> None:
-        self.shown: list[Shown] = []
-        self._most, self._step, self._offered = most, 1, 0
+    def __init__(self, capacity: int = 12) -> None:
+        self.images: list[GalleryImage] = []
+        self._capacity, self._step, self._offered = capacity, 1, 0
 
     def due(self, within: int = 1) -> bool:
         """Whether the next picture, or one of the next few, will be taken."""
         return -self._offered % self._step < within
 
-    def offer(self, draw: Callable[[], Shown | None]) -> None:
+    def offer(self, draw: Callable[[], GalleryImage | None]) -> None:
         """Draw and take the next picture, if it is due and there is one."""
         picture = draw() if self.due() else None
         self._offered += 1
         if picture is None:
             return
-        self.shown.append(picture)
-        if len(self.shown) >= self._most:
-            self.shown, self._step = self.shown[::2], 2 * self._step
+        self.images.append(picture)
+        if len(self.images) >= self._capacity:
+            self.images, self._step = self.images[::2], 2 * self._step

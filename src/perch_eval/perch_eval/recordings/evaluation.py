@@ -12,9 +12,9 @@ from perch_eval import consistency
 from perch_eval.recordings.recording import RecordingError
 from perch_eval.recordings.trajectory import Trajectory
 
-LEAST_POSES = 5
-LEAST_PATH = 0.1  # of a motion whose shape can be compared [m]
-MOST_OPEN = 0.2   # by which errors may turn a path's shape about itself: beyond, its alignment says nothing of the attitude [rad]
+MIN_POSES = 5
+MIN_PATH = 0.1  # of a motion whose shape can be compared [m]
+MAX_ALIGNMENT_ERROR = 0.2  # rotation of the aligned path due to position errors, up to which the attitude is compared [rad]
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | 
         RecordingError: hardly any pose has a true one at its stamp.
     """
     true, kept = truth.at(estimate.stamps)
-    if kept.sum() < LEAST_POSES:
+    if kept.sum() < MIN_POSES:
         raise RecordingError(f"the truth ({_span(truth)}) and the estimate ({_span(estimate)}) have {int(kept.sum())} stamps in common")
     estimate = estimate.chosen(kept)
     # both begin in the same place with the same heading: what VIO cannot know is taken away, tilt is left
@@ -70,40 +70,40 @@ def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | 
     if covariances is not None:
         nees[1:] = consistency.nees(error[1:], covariances[kept][1:] + 1e-12 * np.eye(3))
     off = np.linalg.norm(error, axis=1)
-    figures = {"compared_s": 1e-9 * float(true.stamps[-1] - true.stamps[0]), "path_m": true.length, **_by_evo(estimate, true),
-               "final_error_m": float(off[-1]), "drift_percent": 100.0 * float(off[-1]) / true.length if true.length > LEAST_PATH else np.nan,
+    figures = {"compared_s": 1e-9 * float(true.stamps[-1] - true.stamps[0]), "path_m": true.length, **_evo_metrics(estimate, true),
+               "final_error_m": float(off[-1]), "drift_percent": 100.0 * float(off[-1]) / true.length if true.length > MIN_PATH else np.nan,
                "largest_error_m": float(off.max()), "attitude_rms_deg": float(np.degrees(np.sqrt((turn**2).sum(axis=1).mean()))),
                "nees_position_mean": float(np.nanmean(nees)) if np.isfinite(nees).any() else np.nan}
     return Evaluation(figures, true.stamps, error, turn, nees, truth_W)
 
 
-def _by_evo(estimate: Trajectory, true: Trajectory) -> dict[str, float]:
+def _evo_metrics(estimate: Trajectory, true: Trajectory) -> dict[str, float]:
     """ATE, RPE and scale, as `Evaluation.figures` has them; nan where the motion is too short."""
     from evo.core import metrics
     from evo.core.geometry import GeometryException
     from evo.core.metrics import MetricsException, PoseRelation, Unit
     from evo.core.trajectory import PoseTrajectory3D
 
-    def of(t: Trajectory) -> PoseTrajectory3D:
+    def to_evo(t: Trajectory) -> PoseTrajectory3D:
         return PoseTrajectory3D(t.p.copy(), t.q[:, [3, 0, 1, 2]].copy(), 1e-9 * (t.stamps - true.stamps[0]))
 
     def rms(metric: metrics.PE, ours: PoseTrajectory3D) -> float:
-        metric.process_data((of(true), ours))
+        metric.process_data((to_evo(true), ours))
         return float(metric.get_statistic(metrics.StatisticsType.rmse))
 
-    delta, ours = max(0.1, round(0.1 * true.length, 1)), of(estimate)
+    delta, ours = max(0.1, round(0.1 * true.length, 1)), to_evo(estimate)
     found = dict.fromkeys(("ate_rmse_m", "ate_rmse_deg", "rpe_rmse_m", "rpe_rmse_deg"), np.nan) | {"rpe_delta_m": delta, "scale": np.nan}
-    if true.length < LEAST_PATH:
+    if true.length < MIN_PATH:
         return found
     with suppress(GeometryException):  # along a line, or on the spot
-        scale = float(of(estimate).align(of(true), correct_scale=True)[2])
-        ours.align(of(true))
+        scale = float(to_evo(estimate).align(to_evo(true), correct_scale=True)[2])
+        ours.align(to_evo(true))
         found |= {"ate_rmse_m": rms(metrics.APE(PoseRelation.translation_part), ours), "scale": 1.0 / scale if scale else np.nan}
-        if found["ate_rmse_m"] < MOST_OPEN * _breadth(true.p):
+        if found["ate_rmse_m"] < MAX_ALIGNMENT_ERROR * _breadth(true.p):
             found["ate_rmse_deg"] = rms(metrics.APE(PoseRelation.rotation_angle_deg), ours)
     with suppress(MetricsException):
         found["rpe_rmse_m"], found["rpe_rmse_deg"] = (
-            rms(metrics.RPE(relation, delta, Unit.meters, rel_delta_tol=0.2, all_pairs=True, pairs_from_reference=True), of(estimate))
+            rms(metrics.RPE(relation, delta, Unit.meters, rel_delta_tol=0.2, all_pairs=True, pairs_from_reference=True), to_evo(estimate))
             for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg))
     return found
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 OK, WARNING, FAILS = "ok", "warning", "fails"
-MOST = 10_000.0  # rate of a sensor [Hz]
+RATE_MAX = 10_000.0  # rate of a sensor [Hz]
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Report:
     findings: list[Finding] = field(default_factory=list)
     figures: dict[str, Any] = field(default_factory=dict)
 
-    def say(self, about: str, text: str, warning: bool = False, fails: bool = False) -> None:
+    def add(self, about: str, text: str, warning: bool = False, fails: bool = False) -> None:
         """Add a finding."""
         self.findings.append(Finding(FAILS if fails else WARNING if warning else OK, about, text))
 
@@ -37,7 +37,7 @@ class Report:
         return any(finding.level == FAILS for finding in self.findings)
 
 
-def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, wanted: float, told: float | None) -> float:
+def check_rate(report: Report, about: str, stamps: np.ndarray, minimum: float, recommended: float, nominal: float | None) -> float:
     """Judge the rate, the jitter (1 sigma of an interval, in periods) and the gaps of ascending stamps, three or more; the rate [Hz]."""
     intervals = 1e-9 * np.diff(stamps)
     reach = min(9, len(intervals))  # stamps may come in batches
@@ -46,18 +46,18 @@ def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, w
     gap = (intervals > 1.8 * period) & (beside[:-2] + intervals + beside[2:] > 3.5 * period)
     jitter, gaps = float(intervals[~gap].std() / period) if not gap.all() else np.nan, intervals[gap]
     report.figures[f"{about} rate_hz"] = rate
-    wrong = told is not None and not 0.8 < rate / told < 1.25
-    report.say(f"{about} rate",
-               f"{rate:.1f} Hz over {1e-9 * (stamps[-1] - stamps[0]):.1f} s" + (f", {told:g} Hz in the sensor file" if wrong else "") +
-               (f": at least {wanted:g} Hz are wanted" if rate < wanted else "") +
-               (": stamps are not in nanoseconds" if rate > MOST else ""),
-               warning=rate < wanted or wrong, fails=not least <= rate <= MOST)
-    report.say(f"{about} jitter",
+    wrong = nominal is not None and not 0.8 < rate / nominal < 1.25
+    report.add(f"{about} rate",
+               f"{rate:.1f} Hz over {1e-9 * (stamps[-1] - stamps[0]):.1f} s" + (f", {nominal:g} Hz in the sensor file" if wrong else "") +
+               (f": at least {recommended:g} Hz are recommended" if rate < recommended else "") +
+               (": stamps are not in nanoseconds" if rate > RATE_MAX else ""),
+               warning=rate < recommended or wrong, fails=not minimum <= rate <= RATE_MAX)
+    report.add(f"{about} jitter",
                f"{1e3 * jitter * period:.2f} ms (1 sigma), {100 * jitter:.0f} % of the period" +
                (": stamps are taken on arrival, or in batches; stamp where the sensor is sampled" if jitter > 0.1 else ""),
                warning=jitter > 0.1)
     if len(gaps):
         lost = round(float((gaps / period - 1.0).sum()))
         share = 100 * lost / (len(stamps) + lost)
-        report.say(f"{about} gaps", f"{len(gaps)}, the longest {1e3 * gaps.max():.0f} ms; {lost} missing ({share:.1f} %)", warning=True)
+        report.add(f"{about} gaps", f"{len(gaps)}, the longest {1e3 * gaps.max():.0f} ms; {lost} missing ({share:.1f} %)", warning=True)
     return rate

@@ -6,7 +6,7 @@ import numpy as np
 
 from perch_core.sensors import ImuSensor
 from perch_core.vehicle import GRAVITY
-from perch_eval.recordings.findings import Report, check_rhythm
+from perch_eval.recordings.findings import Report, check_rate
 
 STILL_WINDOW = 0.2  # [s]
 STILL_MEAN = (0.02, 0.2)  # by how much a window's mean may differ from those before it, at rest [rad/s, m/s^2]
@@ -16,47 +16,47 @@ STILL_SIGMA = (0.3, 2.0)  # 1 sigma within a window: rotors that idle shake the 
 def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSensor | None) -> None:
     order, shared = np.diff(stamps) > 0, float(np.mean(np.diff(stamps) == 0))
     if not order.all():
-        report.say("imu stamps", f"{int((~order).sum())} of {len(stamps)} are not newer than the one before", warning=True)
+        report.add("imu stamps", f"{int((~order).sum())} of {len(stamps)} are not newer than the one before", warning=True)
         keep = np.concatenate([[True], stamps[1:] > np.maximum.accumulate(stamps)[:-1]])
         stamps, imu = stamps[keep], imu[keep]
     if len(stamps) < 3:
-        report.say("imu stamps", "all are the same: the driver does not stamp", fails=True)
+        report.add("imu stamps", "all are the same: the driver does not stamp", fails=True)
         return
-    rate = check_rhythm(report, "imu", stamps, least=50.0, wanted=100.0, told=sensor.rate if sensor else None)
+    rate = check_rate(report, "imu", stamps, minimum=50.0, recommended=100.0, nominal=sensor.rate if sensor else None)
     if not np.isfinite(imu).all():
-        report.say("imu values", "some are not finite", fails=True)
+        report.add("imu values", "some are not finite", fails=True)
         imu = np.nan_to_num(imu)
     gyro, accel = imu[:, :3], imu[:, 3:]
     force = float(np.median(np.linalg.norm(accel, axis=1)))
     if 0.8 < force < 1.2:
-        report.say("imu units", f"the specific force is {force:.2f}: in g, where m/s^2 is wanted", fails=True)
+        report.add("imu units", f"the specific force is {force:.2f}: in g instead of m/s^2", fails=True)
     elif force < 5.0:
-        report.say("imu units", f"the specific force is {force:.2f} m/s^2: gravity has been taken off, or the vehicle falls", fails=True)
+        report.add("imu units", f"the specific force is {force:.2f} m/s^2: gravity has been subtracted, or the vehicle is in free fall", fails=True)
     elif abs(force - GRAVITY) > 1.0:
-        report.say("imu units", f"the specific force is {force:.2f} m/s^2 in the median, far from {GRAVITY}", warning=True)
+        report.add("imu units", f"the specific force is {force:.2f} m/s^2 in the median, far from {GRAVITY}", warning=True)
     if np.percentile(np.abs(gyro).max(axis=1), 90) > 35.0:
-        report.say("imu units", "a tenth of the angular rates exceed 35 rad/s: they may be in deg/s", fails=True)
+        report.add("imu units", "a tenth of the angular rates exceed 35 rad/s: they may be in deg/s", fails=True)
     if sensor is not None:
         clipped = (np.abs(gyro) >= 0.99 * sensor.gyro_range).any(axis=1) | (np.abs(accel) >= 0.99 * sensor.accel_range).any(axis=1)
         if clipped.any():
-            report.say("imu range", f"{int(clipped.sum())} samples are at the range of the sensor", warning=True)
+            report.add("imu range", f"{int(clipped.sum())} samples are at the range of the sensor", warning=True)
     rests = [(1e-9 * float(stamps[last] - stamps[first]), first, last) for first, last in stretches_at_rest(stamps, imu)]
     duration, first, last = max(rests, default=(0.0, 0, 0))
     report.figures["still_s"] = duration
     at_start = max((still for still, begin, _ in rests if stamps[begin] - stamps[0] < 0.5e9), default=0.0)
     if duration < 0.5:
-        report.say("rest", "never still for half a second: VIO has to start in motion, and the biases are learnt on the way", warning=True)
+        report.add("rest", "never still for half a second: VIO has to start in motion and to estimate the biases meanwhile", warning=True)
         return
-    report.say("rest",
+    report.add("rest",
                f"still for {duration:.1f} s from {1e-9 * (stamps[first] - stamps[0]):.1f} s on" +
                (": not at the start, so that VIO begins in motion" if at_start < 0.5 else
                 f", for {at_start:.1f} s at the start" if at_start < duration else ""),
                warning=at_start < 0.5)
     bias = gyro[first:last].mean(axis=0)
     report.figures |= {"gyro_bias": bias.tolist(), "force_at_rest": float(np.linalg.norm(accel[first:last].mean(axis=0)))}
-    report.say("gyro bias", f"{np.linalg.norm(bias):.4f} rad/s at rest", warning=bool(np.linalg.norm(bias) > 0.2))
+    report.add("gyro bias", f"{np.linalg.norm(bias):.4f} rad/s at rest", warning=bool(np.linalg.norm(bias) > 0.2))
     if shared > 0.01:
-        report.say("noise", f"not judged: {100 * shared:.0f} % of the samples have the stamp of the one before")
+        report.add("noise", f"not judged: {100 * shared:.0f} % of the samples have the stamp of the one before")
     else:
         _check_noise(report, imu[first:last], rate, sensor)
 
@@ -66,19 +66,19 @@ def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor
     if len(imu) < 100:
         return
     tau, deviation = allan_deviation(imu, rate)
-    short = tau <= max(0.2, tau[0])  # where white noise has the say
+    short = tau <= max(0.2, tau[0])  # where white noise dominates
     white = np.median(deviation[short] * np.sqrt(tau[short])[:, None], axis=0)
     gyro, accel = deviation[:, :3].max(axis=1), deviation[:, 3:].max(axis=1)
     densities = {"gyro": float(white[:3].max()), "accel": float(white[3:].max())}
     report.figures |= {"gyro_noise_density": densities["gyro"], "accel_noise_density": densities["accel"], "allan_tau_s": tau.tolist(),
                        "allan_gyro": gyro.tolist(), "allan_accel": accel.tolist()}
     if tau[-1] >= 5.0:
-        report.say("bias stability", f"gyro {gyro.min():.1e} rad/s, accelerometer {accel.min():.1e} m/s^2 (least Allan deviation)")
+        report.add("bias stability", f"gyro {gyro.min():.1e} rad/s, accelerometer {accel.min():.1e} m/s^2 (least Allan deviation)")
     for name, unit in (("gyro", "rad/s/sqrt(Hz)"), ("accel", "m/s^2/sqrt(Hz)")):
-        told = getattr(sensor, f"{name}_noise_density") if sensor is not None else np.inf
-        more = densities[name] > 2.0 * told
-        report.say(f"{name} noise", f"{densities[name]:.1e} {unit} at rest" + (f", {told:.1e} in the sensor file" if sensor is not None else "")
-                   + (": the filter will trust the sensor too much" if more else ""), warning=more)
+        nominal = getattr(sensor, f"{name}_noise_density") if sensor is not None else np.inf
+        more = densities[name] > 2.0 * nominal
+        report.add(f"{name} noise", f"{densities[name]:.1e} {unit} at rest" + (f", {nominal:.1e} in the sensor file" if sensor is not None else "")
+                   + (": the filter will weight the sensor too much" if more else ""), warning=more)
 
 
 def stretches_at_rest(stamps: np.ndarray, imu: np.ndarray) -> list[tuple[int, int]]:

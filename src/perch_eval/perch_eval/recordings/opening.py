@@ -1,4 +1,4 @@
-"""Which kind of recording a path is: a bag, a folder in the ASL format, or images, of which nothing is known but what each one shows."""
+"""Opens the recording at a path: a bag, a folder in the ASL format, or single images."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from pathlib import Path
 from perch_core.sensors import Sensors
 from perch_eval.recordings.asl import AslRecording, root_of
 from perch_eval.recordings.bag import BagRecording, is_bag
-from perch_eval.recordings.recording import PICTURES, Event, Recording, RecordingError, picture
+from perch_eval.recordings.recording import IMAGE_SUFFIXES, Event, Recording, RecordingError, picture
 
 PERIOD = 1_000_000_000  # between the stamps that the images are given [ns]
 
 
-def pictures_in(path: Path) -> list[Path]:
+def image_files(path: Path) -> list[Path]:
     """The image files of a folder in the order of their names; of a file, itself."""
     files = [path] if path.is_file() else sorted(path.iterdir()) if path.is_dir() else []
-    return [file for file in files if file.suffix.lower() in PICTURES and file.is_file()]
+    return [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES and file.is_file()]
 
 
-class PictureFolder(Recording):
+class ImageFolder(Recording):
     """Images without a time of their own."""
     def __init__(self, path: Path, sensors: Sensors | None) -> None:
         """
@@ -27,14 +27,14 @@ class PictureFolder(Recording):
             RecordingError: there is no image.
         """
         super().__init__(path, sensors)
-        self.files = pictures_in(path)
+        self.files = image_files(path)
         if not self.files:
             raise RecordingError(f"{path}: no image in it")
         self.camera = next(iter(sensors.cameras), "camera") if sensors is not None else "camera"
         self.images = {self.camera: len(self.files)}
 
     def events(self) -> Iterator[Event]:
-        """The images in the order of their names, one a second; those that are none are left out and said in `damage`."""
+        """The images in the order of their names, one a second; those that cannot be decoded are left out and listed in `damage`."""
         bad = []
         for number, file in enumerate(self.files):
             try:
@@ -63,7 +63,7 @@ def open_recording(path: Path, sensors: Sensors | None) -> Recording:
         return BagRecording(path, sensors)
     if path.is_dir() and root_of(path) is not None:
         return AslRecording(path, sensors)
-    if pictures_in(path):
-        return PictureFolder(path, sensors)
+    if image_files(path):
+        return ImageFolder(path, sensors)
     raise RecordingError(f"{path}: is no recording: neither a bag (.bag, .mcap, .db3, a folder with metadata.yaml), nor a folder in the "
                          "format of EuRoC (mav0/cam0/data.csv), nor images")

@@ -1,4 +1,4 @@
-"""The components of perception in a row, as the graph has them: whoever emits is heard at once, and nothing waits for a clock."""
+"""The components of perception in a row, as the graph has them: outputs are delivered at once, and nothing waits for a clock."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from perch_core.tag_board import load_board
 from perch_core.values import (CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState, OdometryState, PowerlineMap,
                                TargetPose, TargetSighting)
 from perch_eval.node_launch import read_parameters
-from perch_eval.recordings.drawing import Gallery, Shown, canvas, caption, draw_board, draw_wires
+from perch_eval.recordings.drawing import Gallery, GalleryImage, canvas, caption, draw_board, draw_wires
 from perch_eval.recordings.recording import Event
 from perch_perception.camera_component import CameraComponent
 from perch_perception.estimator_component import StateEstimator
@@ -26,8 +26,8 @@ from perch_perception.powerline_mapper import PowerlineMapper
 from perch_perception.target_localizer import TargetLocalizer
 from perch_perception.vio_component import VioComponent
 
-KNOWN = 100.0  # 1 sigma of a position that means something [m]
-TAIL = 8  # frames that a picture of tracks looks back
+MAX_POSITION_SIGMA = 100.0  # 1 sigma of a position that is kept [m]
+TAIL = 8  # frames of history in a picture of tracks
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ class _Vio(VioComponent):
         self.frames.append(Frame(image.stamp, r.outcome.name, r.features, r.used, r.refused, r.restarts, time.process_time() - begin))
         text = f"{r.outcome.name.lower()}: {r.features} tracks, {r.used} used"
 
-        def shown() -> Shown | None:
+        def shown() -> GalleryImage | None:
             pixels = drawn[-1].pixels() if drawn else None
-            return None if pixels is None else Shown(image.stamp, text, pixels)
+            return None if pixels is None else GalleryImage(image.stamp, text, pixels)
 
         self.gallery.offer(shown)
 
@@ -85,19 +85,19 @@ class _Target(TargetLocalizer):
     def look(self, image: CameraImage, exposed: float) -> None:
         """As it does."""
         super().look(image, exposed)
-        seen = self.sightings[-1]
-        (self.missed if seen.pose_camera is None else self.found).offer(lambda: self._drawn(image, seen))
+        sighting = self.sightings[-1]
+        (self.missed if sighting.pose_camera is None else self.found).offer(lambda: self._drawn(image, sighting))
 
-    def _drawn(self, image: CameraImage, seen: TargetSighting) -> Shown | None:
+    def _drawn(self, image: CameraImage, sighting: TargetSighting) -> GalleryImage | None:
         if image.pixels() is None:
             return None
         camera = self.mounted.known.camera
         drawn = canvas(mono_image(image, camera))
-        text = seen.message
-        if seen.pose_camera is not None:
-            draw_board(drawn, camera, load_board(self.config.board), seen.pose_camera, seen.ids)
-            text = f"tags {list(seen.ids)}, {np.linalg.norm(seen.pose_camera.p_WS):.2f} m, rms {seen.reprojection_rms:.2f} px"
-        return Shown(image.stamp, text, caption(drawn, text[:80]))
+        text = sighting.message
+        if sighting.pose_camera is not None:
+            draw_board(drawn, camera, load_board(self.config.board), sighting.pose_camera, sighting.ids)
+            text = f"tags {list(sighting.ids)}, {np.linalg.norm(sighting.pose_camera.p_WS):.2f} m, rms {sighting.reprojection_rms:.2f} px"
+        return GalleryImage(image.stamp, text, caption(drawn, text[:80]))
 
 
 class _Wires(PowerlineMapper):
@@ -110,7 +110,7 @@ class _Wires(PowerlineMapper):
         super().look(image, exposed)
         self.gallery.offer(lambda: self._drawn(image))
 
-    def _drawn(self, image: CameraImage) -> Shown | None:
+    def _drawn(self, image: CameraImage) -> GalleryImage | None:
         if image.pixels() is None:
             return None
         camera = self.mounted.known.camera
@@ -118,17 +118,17 @@ class _Wires(PowerlineMapper):
         wires = detect_lines(pixels, camera, self.config.detection)
         drawn = canvas(mono_image(image, camera))
         draw_wires(drawn, camera, wires)
-        return Shown(image.stamp, f"{len(wires)} wires", caption(drawn, f"{len(wires)} wires"))
+        return GalleryImage(image.stamp, f"{len(wires)} wires", caption(drawn, f"{len(wires)} wires"))
 
 
 class Perception:
-    """VIO, estimator, target localiser and powerline mapper, and what they have said.
+    """VIO, estimator, target localiser and powerline mapper, and their outputs.
 
     Attributes:
         vio: the component of VIO.
         states: of VIO.
-        odometry: the estimator's, one for each IMU sample from when it knows where it is.
-        health: the estimator's word on itself.
+        odometry: the estimator's, one for each IMU sample once its position is known.
+        health: the estimator's status.
         sightings, targets: of the target localiser.
         lines: the last map; None: there is none.
         log: (node, level, text), each text once.
@@ -157,7 +157,7 @@ class Perception:
         self.estimator: StateEstimator = self._make("estimator", StateEstimator, common)
         self.target: _Target | None = self._make("target_localizer", _Target, ahead | {"board": board})
         self.wires: _Wires | None = self._make("powerline_mapper", _Wires, ahead | {"detection.appearance": wires})
-        self._looking: list[tuple[str, CameraComponent[Any] | None]] = [(down, self.vio), (front, self.target), (front, self.wires)]
+        self._camera_components: list[tuple[str, CameraComponent[Any] | None]] = [(down, self.vio), (front, self.target), (front, self.wires)]
         self.states: list[InertialState] = []
         self.odometry: list[OdometryState] = []
         self.health: list[EstimatorHealth] = []
@@ -168,7 +168,7 @@ class Perception:
         self.vio.state.receivers += [self.states.append, self.estimator.on_vio_state]
         self.vio.odometry.receivers.append(self.estimator.on_vio_odometry)
         self.estimator.status.receivers.append(self.health.append)
-        self.estimator.odometry.receivers.append(self._keep)
+        self.estimator.odometry.receivers.append(self._store_odometry)
         if self.target is not None:
             self.target.sightings, self.target.found, self.target.missed = self.sightings, Gallery(), Gallery(4)
             self.target.sighting.receivers.append(self.sightings.append)
@@ -179,14 +179,14 @@ class Perception:
             self.wires.powerlines.receivers.append(lambda lines: setattr(self, "lines", lines))
             self.estimator.odometry.receivers.append(self.wires.on_odometry)
 
-    def take(self, event: Event) -> None:
-        """Give the components what a sensor said."""
+    def process(self, event: Event) -> None:
+        """Pass a sensor's data to the components."""
         value = event.value
         if isinstance(value, ImuSample):
             self.estimator.on_imu(value)
             self.vio.on_imu(value)
             return
-        for camera, component in self._looking:
+        for camera, component in self._camera_components:
             if component is not None and camera == event.source:
                 component.on_camera_info(CameraModel(value.stamp, value.frame, self._sensors.cameras[camera].camera))
                 component.on_image(value)
@@ -197,14 +197,14 @@ class Perception:
             return None
         parameters = config.flattened(read_parameters(node)) | dict(given) | config.flattened(self._overrides.get(node, {}))
         component = cls(config.from_mapping(cls.config_type, config.nested(parameters), node))
-        component.log.receivers.append(lambda line: self._note(node, line))
+        component.log.receivers.append(lambda line: self._record_log(node, line))
         return component
 
-    def _keep(self, odometry: OdometryState) -> None:
-        if odometry.pose_covariance[0, 0] < KNOWN**2:
+    def _store_odometry(self, odometry: OdometryState) -> None:
+        if odometry.pose_covariance[0, 0] < MAX_POSITION_SIGMA**2:
             self.odometry.append(odometry)
 
-    def _note(self, node: str, line: LogLine) -> None:
+    def _record_log(self, node: str, line: LogLine) -> None:
         key = (node, line.level, line.text)
         if line.level != "info" and (key in self.log or len(self.log) < 200):
             self.log[key] = self.log.get(key, 0) + 1

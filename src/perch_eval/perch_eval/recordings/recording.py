@@ -1,4 +1,4 @@
-"""A recording as its readers give it: what the IMU and the cameras said, in the order in which it arrived."""
+"""A recording as its readers give it: data of IMU and cameras in the order of arrival."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from perch_core.errors import PerchError
 from perch_core.sensors import CameraSensor, Sensors
 from perch_core.urdf import optical_frame
 from perch_core.values import CameraImage, ImuSample
-from perch_eval.campaign.progress import counted
+from perch_eval.campaign.progress import with_progress
 
 IMU = "imu"
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp")
 
 
 class RecordingError(PerchError):
-    """A recording, or a file that belongs to it, cannot be read, or does not hold what is asked for."""
+    """A recording, or a file that belongs to it, cannot be read, or does not hold the requested data."""
 
 
 class Event(NamedTuple):
-    """Something that a sensor said.
+    """One message of a sensor.
 
     Attributes:
         source: `imu`, or the name of the camera.
         arrived: when it was recorded [ns]; its stamp where that is not known.
-        value: what it said, in the sensor's own axes.
+        value: its data, in the sensor's own axes.
     """
 
     source: str
@@ -61,7 +61,7 @@ class Recording(ABC):
 
     def read(self) -> Iterator[Event]:
         """The events, counted on their way."""
-        return counted(self.events(), self.samples + sum(self.images.values()), what="messages")
+        return with_progress(self.events(), self.samples + sum(self.images.values()), unit="messages")
 
     @property
     def truth(self) -> Path | None:
@@ -69,8 +69,8 @@ class Recording(ABC):
         return None
 
 
-class _Picture(CameraImage):
-    """An image on file, decoded when somebody looks at it."""
+class _FileImage(CameraImage):
+    """An image on file, decoded when its pixels are read."""
 
     __slots__ = ("path", )
     path: Path
@@ -80,7 +80,7 @@ def picture(path: Path, stamp: int, name: str, camera: CameraSensor | None) -> C
     """An image file as a camera's image; grey unless the camera delivers colour, 16 bits as their upper 8.
 
     Args:
-        path: of the file; one that cannot be decoded is found out when somebody looks.
+        path: of the file; one that cannot be decoded is detected when its pixels are read.
         stamp: [ns].
         name: of the camera.
         camera: what it is; None: as the file has it.
@@ -97,7 +97,7 @@ def picture(path: Path, stamp: int, name: str, camera: CameraSensor | None) -> C
     else:
         width, height = camera.width, camera.height
     whole = cache(lambda: decoded(path, flag))
-    image = _Picture(stamp, optical_frame(name), width, height, encoding, lambda region=None: whole())
+    image = _FileImage(stamp, optical_frame(name), width, height, encoding, lambda region=None: whole())
     image.path = path
     return image
 

@@ -14,7 +14,7 @@ from perch_core.json_values import write_json
 from perch_eval.page import image, images, page, section, table
 from perch_eval.recordings.findings import Finding
 from perch_eval.recordings.evaluation import Evaluation
-from perch_eval.recordings.drawing import Shown
+from perch_eval.recordings.drawing import GalleryImage
 from perch_eval.recordings.perception import Frame, Perception
 from perch_eval.recordings.recording import Recording
 from perch_eval.recordings.trajectory import Trajectory
@@ -24,13 +24,13 @@ COLOURS = {"TRACKING": "#2ca02c", "RESTING": "#1f77b4", "LEAVING": "#17becf", "B
 
 
 @dataclass
-class Told:
-    """What is told of a recording: figures for JSON, rows of words, plots and pictures by title."""
+class ReportContent:
+    """Content of a recording's report: figures for JSON, rows of text, plots and pictures by title."""
 
     figures: dict[str, Any]
     rows: list[tuple[str, str]]
     plots: dict[str, Figure] = field(default_factory=dict)
-    pictures: dict[str, Sequence[Shown]] = field(default_factory=dict)
+    pictures: dict[str, Sequence[GalleryImage]] = field(default_factory=dict)
 
     def write(self, folder: Path, recording: Recording, findings: Sequence[Finding] = (), log: Mapping[tuple[str, str, str], int] = {}) -> None:
         """Into `report.json` and `report.html`, and to the terminal; with the findings of the check, and (node, level, text) -> how often."""
@@ -65,7 +65,7 @@ def path_figure(estimate: Trajectory, evaluation: Evaluation | None) -> Figure:
 
 
 def frames_figure(frames: Sequence[Frame]) -> Figure:
-    """Tracks over time; the background says what VIO made of each frame."""
+    """Tracks over time; the background shows VIO's outcome for each frame."""
     figure = Figure(figsize=(11, 3.2), layout="constrained")
     axes = figure.subplots()
     t = 1e-9 * np.array([f.stamp - frames[0].stamp for f in frames])

@@ -23,7 +23,7 @@ EXAMPLES = """examples:
   python3 scripts/sensors.py import kalibr camchain-imucam.yaml imu.yaml --rename cam0=down cam1=front --imu-orientation 0 0.7071 0 0.7071
   python3 scripts/sensors.py check flight.mcap --sensors mine.yaml
 
-exit code: 0 done (nothing would fail), 1 something would make perception fail, 2 the caller's mistake, 130 interrupted"""
+exit code: 0 done (nothing would fail), 1 something would make perception fail, 2 invalid input, 130 interrupted"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -41,10 +41,10 @@ def parser() -> argparse.ArgumentParser:
     read.add_argument("--rename", nargs="+", default=[], metavar="OLD=NEW", help="names of the cameras, as cam0=down")
     read.add_argument("--imu-orientation", nargs=4, type=float, default=(0.0, 0.0, 0.0, 1.0), metavar=("X", "Y", "Z", "W"),
                       help="axes of the IMU in the body (forward, left, up), as a quaternion (default: the body has the IMU's axes)")
-    judge = verbs.add_parser("check", help="find what would make perception fail on a recording")
-    judge.set_defaults(work=_check)
-    judge.add_argument("recording", type=Path, metavar="RECORDING")
-    judge.add_argument("--sensors", metavar="FILE",
+    check_parser = verbs.add_parser("check", help="find what would make perception fail on a recording")
+    check_parser.set_defaults(work=_check)
+    check_parser.add_argument("recording", type=Path, metavar="RECORDING")
+    check_parser.add_argument("--sensors", metavar="FILE",
                        help="sensor file, or its name in config/sensors (default: the recording's own calibration)")
     return out
 
@@ -65,7 +65,7 @@ def _import(args: argparse.Namespace) -> int:
         sensors = from_asl(root, R_BI)
     text = to_yaml(
         _renamed(sensors, args), f"Made by `scripts/sensors.py import {args.kind}` of {', '.join(file.name for file in args.files)}.\n"
-        "1 sigma of the calibration (`sigma`) and turn-on biases are defaults: look into the reports and data sheets.")
+        "1 sigma of the calibration (`sigma`) and turn-on biases are defaults: see calibration report and data sheet.")
     if args.out is None:
         print(text, end="")
     else:
@@ -77,7 +77,7 @@ def _import(args: argparse.Namespace) -> int:
 
 
 def _renamed(sensors: Sensors, args: argparse.Namespace) -> Sensors:
-    """The sensors with the names that are wanted."""
+    """The sensors with the requested names."""
     names = dict(pair.split("=", 1) if "=" in pair else (pair, "") for pair in args.rename)
     for old, new in names.items():
         if old not in sensors.cameras or not new.isidentifier():

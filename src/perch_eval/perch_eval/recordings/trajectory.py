@@ -34,7 +34,7 @@ class Trajectory:
     q: np.ndarray
 
     @classmethod
-    def of(cls, poses: Iterable[tuple[int, Any, Any]]) -> Trajectory:
+    def from_poses(cls, poses: Iterable[tuple[int, Any, Any]]) -> Trajectory:
         """(stamp [ns], position, attitude) of each pose."""
         rows = list(poses)
         return cls(np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], float).reshape(-1, 3),
@@ -108,7 +108,7 @@ def read_truth(recording: Recording, given: str | None) -> Trajectory | None:
         return read_trajectory(Path(given))
     if isinstance(recording, BagRecording) and given.startswith("/"):
         rows = recording.poses(given)
-        return _checked(f"{recording.path}: {given}", np.array([row[0] for row in rows], np.int64), np.array([row[1:] for row in rows], float))
+        return _validated(f"{recording.path}: {given}", np.array([row[0] for row in rows], np.int64), np.array([row[1:] for row in rows], float))
     raise RecordingError(f"--truth {given}: is no file{', and no topic' if isinstance(recording, BagRecording) else ''}")
 
 
@@ -129,7 +129,7 @@ def read_trajectory(path: Path) -> Trajectory:
             values = np.array([row[1:8] for row in rows], float)
         except (ValueError, IndexError, ArithmeticError):
             raise RecordingError(f"{path}: is no trajectory: neither TUM's (stamp [s] x y z qx qy qz qw) nor EuRoC's format") from None
-    return _checked(str(path), stamps, values)
+    return _validated(str(path), stamps, values)
 
 
 def _nanoseconds(text: str) -> int:
@@ -138,7 +138,7 @@ def _nanoseconds(text: str) -> int:
     return int(value if "e" in text.lower() and value > 1e14 else value * 10**9)
 
 
-def _checked(source: str, stamps: np.ndarray, values: np.ndarray) -> Trajectory:
+def _validated(source: str, stamps: np.ndarray, values: np.ndarray) -> Trajectory:
     """Poses in the order of their stamps, each stamp once, quaternions of length one."""
     if values.ndim != 2 or values.shape[1] != 7 or len(stamps) < 2:
         raise RecordingError(f"{source}: is no trajectory of two poses or more")

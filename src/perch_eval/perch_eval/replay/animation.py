@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from perch_core import so3
 from perch_core.errors import PerchError
-from perch_eval.campaign.progress import counted
-from perch_eval.flight_view import ESTIMATE, LIMIT, TRUTH, WANTED, FlightView
+from perch_eval.campaign.progress import with_progress
+from perch_eval.flight_view import ESTIMATE, LIMIT, REFERENCE, TRUTH, FlightView
 from perch_eval.metrics import tilt_degrees
 from perch_eval.replay.stroboscope import Observer, draw_place, draw_vehicle
 
@@ -51,7 +51,7 @@ class Scene:
         axes.plot(*self._observer.project(p).T, color="0.85", lw=1.0)
         if view.reference is not None:
             keep = (view.reference.t >= self._start) & (view.reference.t <= end)
-            axes.plot(*self._observer.project(view.reference.p[keep]).T, color=WANTED, lw=1.0, label="reference")
+            axes.plot(*self._observer.project(view.reference.p[keep]).T, color=REFERENCE, lw=1.0, label="reference")
         (self._path,) = axes.plot([], [], color=TRUTH, lw=1.6, label="flown")
         (self._estimated,) = axes.plot([], [], color=ESTIMATE, lw=0.9, ls="--", label="estimate")
         axes.set_aspect("equal")
@@ -95,9 +95,9 @@ class Scene:
         self._space.set_title(f"t = {time:.2f} s   {speed:.1f} m/s   tilt {tilt_degrees(now.q)[0]:.0f} deg", fontsize=10)
 
     def _show_image(self, time: float) -> None:
-        seen = [image for t, image in self._view.camera if t <= time]
-        if seen:
-            pixels = seen[-1].pixels()
+        images = [image for t, image in self._view.camera if t <= time]
+        if images:
+            pixels = images[-1].pixels()
             if pixels is not None:
                 self._shown.set_data(pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
 
@@ -117,7 +117,7 @@ def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path) -> 
     writers = {".gif": _write_gif, ".mp4": _write_mp4}
     if path.suffix.lower() not in writers:
         raise PerchError(f"{path}: the ending is none of .gif, .mp4 and .png")
-    writers[path.suffix.lower()](path, fps, counted(_frames(scene, times), len(times), what="frames"))
+    writers[path.suffix.lower()](path, fps, with_progress(_frames(scene, times), len(times), unit="frames"))
 
 
 def _frames(scene: Scene, times: np.ndarray) -> Iterator[np.ndarray]:

@@ -14,7 +14,7 @@ from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.arguments import command, command_parser, count
 from perch_eval.flight_view import FlightView
-from perch_eval.recorded import opened, report_of, vehicle_of
+from perch_eval.recorded import identify_vehicle, read_flight, read_report
 from perch_eval.replay.animation import Scene, write_animation
 from perch_eval.replay.stroboscope import stroboscope
 
@@ -26,7 +26,7 @@ EXAMPLES = """examples:
   python3 scripts/replay.py out/flight.mcap --out perch.png       the vehicle at ten instants of the perch, in one picture
   python3 scripts/replay.py out/flight.mcap --plots plots         and the plots as PNG
 
-exit code: 0 written, 2 the caller's mistake (no such recording, nothing in it)"""
+exit code: 0 written, 2 invalid input (no such recording, nothing in it)"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -49,10 +49,10 @@ def _show(args: argparse.Namespace) -> int:
     for name in ("fps", "speed"):
         if not 0.0 < getattr(args, name) < np.inf:
             raise PerchError(f"--{name} {getattr(args, name):g} is not a number > 0")
-    flight = opened(args.flight, args.namespace)
+    flight = read_flight(args.flight, args.namespace)
     flight.known_states("ground_truth/odometry")
-    vehicle = vehicle_of(flight, {} if args.vehicle else report_of(flight), args.vehicle)
-    view = FlightView.of(flight, vehicle or load_vehicle("snapdragon"))
+    vehicle = identify_vehicle(flight, {} if args.vehicle else read_report(flight), args.vehicle)
+    view = FlightView.from_flight(flight, vehicle or load_vehicle("snapdragon"))
     path = args.out or args.flight.with_suffix(".gif")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".png":

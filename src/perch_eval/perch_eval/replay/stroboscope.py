@@ -57,7 +57,7 @@ def stroboscope(view: FlightView, start: float, end: float, instants: int = 10) 
 
 
 class Observer:
-    """Who sees the flight go to the right, from so far away that lines stay parallel.
+    """A viewpoint from which the flight goes to the right, so far away that lines stay parallel.
 
     Attributes:
         towards: direction from the flight to the observer, shape (3,).

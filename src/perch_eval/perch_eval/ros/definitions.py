@@ -1,4 +1,4 @@
-"""Message types by name, and their definitions as MCAP and Foxglove want them."""
+"""Message types by name, and their definitions as MCAP and Foxglove need them."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def schema_of(msg_type: type) -> Schema:
 
 def message_definition(name: str) -> str:
     """Definition of a type followed by those of everything it contains, in MCAP's `ros2msg` form."""
-    seen: dict[str, str] = {}
+    definitions: dict[str, str] = {}
 
     def collect(full: str) -> None:
         package, kind, short = full.split("/")
-        if full in seen:
+        if full in definitions:
             return
-        seen[full] = (Path(get_package_share_directory(package)) / kind / f"{short}.msg").read_text()
+        definitions[full] = (Path(get_package_share_directory(package)) / kind / f"{short}.msg").read_text()
         fields = getattr(import_module(f"{package}.{kind}"), short).get_fields_and_field_types()
         for inner_package, inner in re.findall(r"(\w+)/(\w+)", " ".join(fields.values())):
             collect(f"{inner_package}/msg/{inner}")
 
     collect(name)
-    own = seen.pop(name)
-    return "\n".join([own, *(f"{'=' * 80}\nMSG: {full.replace('/msg/', '/')}\n{text}" for full, text in seen.items())])
+    own = definitions.pop(name)
+    return "\n".join([own, *(f"{'=' * 80}\nMSG: {full.replace('/msg/', '/')}\n{text}" for full, text in definitions.items())])

@@ -1,4 +1,4 @@
-"""A visit to a running graph: a node in a ROS context of its own, whose callbacks run while its owner waits."""
+"""A temporary node in a running graph, in a ROS context of its own; its callbacks run while its owner waits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
-from perch_core.ros.joining import join
+from perch_core.ros.ros_init import init_ros
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -19,7 +19,7 @@ SLICE = 0.05  # of a wait, after which an interrupt counts [s]
 
 
 class GraphNode:
-    """A visitor. An interrupt ends its present wait, or what comes next: an exception out of a signal handler would end in rclpy's C++.
+    """The node. An interrupt ends its present wait, or the next one: an exception out of a signal handler would end in rclpy's C++.
 
     Attributes:
         node: for publishers, subscriptions and clients.
@@ -33,7 +33,7 @@ class GraphNode:
             interrupts: signals that are a KeyboardInterrupt of the main thread's wait.
         """
         self._context = Context()
-        join([], self._context)
+        init_ros([], self._context)
         self.node = Node(name, context=self._context, cli_args=["--ros-args", *arguments], start_parameter_services=False, enable_rosout=False)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -66,7 +66,7 @@ class GraphNode:
             self.spin(SLICE)
         return found
 
-    def listen(self, duration: float) -> float:
+    def spin_for(self, duration: float) -> float:
         """Run what comes for some wall-clock time; returns how long it really was [s]."""
         begin = time.monotonic()
         while (left := begin + duration - time.monotonic()) > 0.0:
@@ -74,16 +74,16 @@ class GraphNode:
         return time.monotonic() - begin
 
     def nodes(self) -> set[str]:
-        """Fully qualified names of the nodes in the graph, as far as this one has been told."""
+        """Fully qualified names of the nodes in the graph that this one has discovered."""
         return {f"{namespace.rstrip('/')}/{name}" for name, namespace in self.node.get_node_names_and_namespaces()}
 
     def visible_nodes(self) -> set[str]:
-        """The same after a look at what has come."""
+        """The same, after running what has come."""
         self.spin(0.02)
         return self.nodes()
 
     def close(self) -> None:
-        """Leave the graph. An interrupt that nobody has looked for counts now."""
+        """Leave the graph. An interrupt that no wait has raised is raised now."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler or signal.SIG_DFL)
         self._executor.shutdown()  # it holds the context, and so the middleware's threads, sockets and shared memory

@@ -1,4 +1,4 @@
-"""Components that take messages as they are on the wire."""
+"""Components that take serialised messages."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from perch_core.ros import topics
 from perch_core.values import CameraImage, Serialized
 
 CAMERAS = ("down", "front")
-STAMPLESS = ("/tf", "/tf_static", "robot_description", "trajectory", "recovery")
+WITHOUT_STAMP = ("/tf", "/tf_static", "robot_description", "trajectory", "recovery")
 """Channels whose messages have no header, or the stamp of a start that lies ahead: the newest stamp of the others counts."""
 
 C = TypeVar("C")
 T = TypeVar("T", bound=type[Component[Any]])
 
 
-class Wire(Input[Serialized]):
+class SerializedInput(Input[Serialized]):
     """All messages of a channel, for `on_message(channel, message)`."""
 
     def handler(self, component: Component[Any]) -> Callable[[Serialized], None]:
@@ -27,7 +27,7 @@ class Wire(Input[Serialized]):
         return partial(component.on_message, self.channel(component))
 
 
-class Images(Input[CameraImage]):
+class ImageInput(Input[CameraImage]):
     """The images of a camera, for `on_image(camera, image)`."""
 
     def __init__(self, camera: str) -> None:
@@ -66,17 +66,18 @@ class Listener(Component[C]):
         if not isinstance(message, Serialized):
             stamp = getattr(message, "stamp", 0)
             message = Serialized(self.resolve(channel), stamp, topics.encode(channel, message), topics.message_type(channel))
-        if channel in STAMPLESS:
+        if channel in WITHOUT_STAMP:
             return message._replace(stamp=self.newest)
         self.newest = max(self.newest, message.stamp)
         return message
 
 
-def listening(channels: Iterable[str]) -> Callable[[T], T]:
-    """Gives a `Listener` a lazy port for each channel and camera."""
+def subscribed_to(channels: Iterable[str]) -> Callable[[T], T]:
+    """Class decorator that gives a `Listener` a lazy port for each channel and camera."""
 
     def declare(cls: T) -> T:
-        found: list[Wire | Images] = [*(Wire(Serialized, channel, lazy=True) for channel in channels), *map(Images, CAMERAS)]
+        found: list[SerializedInput | ImageInput] = [
+            *(SerializedInput(Serialized, channel, lazy=True) for channel in channels), *map(ImageInput, CAMERAS)]
         for port in found:
             name = "in_" + port._channel.strip("/").replace("/", "_")
             port.__set_name__(cls, name)

@@ -25,12 +25,12 @@ from perch_sim.scenario import Scenario
 
 SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
 """Services that a planner offers once it is compiled and warm, which may be long after its node is visible."""
-STALL = 60.0            # without progress or an answer of the mission [s]
-START_PATIENCE = 300.0  # [s] a node whose sources changed compiles first
-CANCEL_PATIENCE = 60.0  # simulation time that the mission has to end a cancelled goal: to leave a perch, or to descend [s]
-LOOK = 0.5              # between looks whether the mission that took the goal is still there [s]
-NAMED = 5.0             # time that stands still for so long is explained [s]
-SILENT = 3.0            # a node of which `/diagnostics` has brought nothing for so long is named [s]
+STALL_TIMEOUT = 60.0    # without progress or an answer of the mission [s]
+START_TIMEOUT = 300.0   # [s] a node whose sources changed compiles first
+CANCEL_TIMEOUT = 60.0   # simulation time that the mission has to end a cancelled goal: to leave a perch, or to descend [s]
+CHECK_PERIOD = 0.5      # of the check whether the mission that took the goal is still there [s]
+EXPLAIN_AFTER = 5.0     # simulation time that has not advanced for so long is explained [s]
+SILENCE_TIMEOUT = 3.0   # a node that has sent no diagnostics for so long is reported [s]
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FlightResult:
 
     Attributes:
         outcome: `perched` or the lower-case name of the error code.
-        message: the mission's words.
+        message: of the mission.
         end_time: simulation time at the end [s].
         wall_time: wall-clock time from the goal, or from when simulation time began after it, to the end [s].
         start_time: simulation time then [s]; None where the goal never was sent.
@@ -53,25 +53,25 @@ class FlightResult:
 
 
 class _Progress:
-    """Watches simulation time: since when it passes, and whether it stands still."""
+    """Monitors simulation time: since when it advances, and whether it has stopped."""
 
     def __init__(self, time_now: float) -> None:
-        self.began = self._moved = time.monotonic()
+        self.began = self._last_progress = time.monotonic()
         self.start = self._last = time_now
         self._explained = False
 
-    def look(self, time_now: float) -> float:
-        """Wall-clock time for which simulation time has stood still [s]."""
+    def update(self, time_now: float) -> float:
+        """Take the present simulation time [s]; returns the wall-clock time for which it has not advanced [s]."""
         now = time.monotonic()
         if time_now > self._last:
             if self._last == 0.0:  # it begins
                 self.began, self.start = now, time_now
-            self._last, self._moved, self._explained = time_now, now, False
-        return now - self._moved
+            self._last, self._last_progress, self._explained = time_now, now, False
+        return now - self._last_progress
 
-    def explain(self) -> bool:
-        """Once whenever it stands still: whether that is to be explained now."""
-        if self._explained or time.monotonic() - self._moved < NAMED:
+    def should_explain(self) -> bool:
+        """Whether a stop of simulation time is to be explained now; True once for each stop."""
+        if self._explained or time.monotonic() - self._last_progress < EXPLAIN_AFTER:
             return False
         self._explained = True
         return True
@@ -81,9 +81,9 @@ class MissionClient(GraphNode):
     """The mission's client. Time is that of `/clock`, in a namespace that of its `clock`.
 
     Attributes:
-        time: newest simulation time seen [s].
-        waiting_for: who the vehicle waits for, with what it owes, as it says on `/diagnostics`; empty: for nobody.
-        processes: node -> where it runs, as its newest diagnostics say; another process after a restart.
+        time: newest simulation time received [s].
+        waiting_for: the node that the vehicle waits for and the missing message, from its `/diagnostics`; empty: none.
+        processes: node -> its process, from its newest diagnostics; another one after a restart.
     """
 
     def __init__(self, namespace: str = "") -> None:
@@ -94,67 +94,67 @@ class MissionClient(GraphNode):
         super().__init__("mission_client", in_namespace(namespace))
         self._client = ActionClient(self.node, Perch, "perch")
         self._vehicle = self.node.get_namespace().rstrip("/") + "/vehicle"
-        self.time, self.waiting_for, self._looked = 0.0, "", 0.0
-        self._heard: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
+        self.time, self.waiting_for, self._last_check = 0.0, "", 0.0
+        self._last_message: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
         self.processes: dict[str, str] = {}
         self._silent: set[str] = set()
-        self._news: list[str] = []
+        self._node_events: list[str] = []
         self.node.create_subscription(Clock, "/clock", self._receive_clock, topics.topic("/clock").qos.subscribe)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._receive_diagnostics,
                                        topics.topic("/diagnostics").qos.subscribe)
 
-    def news(self) -> list[str]:
-        """Which nodes, since the last call, have been started anew, or have fallen silent though others speak: they hang, or have ended.
+    def node_events(self) -> list[str]:
+        """Nodes that, since the last call, were restarted or stopped sending diagnostics while others send them: they hang, or have ended.
 
-        Nodes of one process take turns: where one of them speaks, the others have but to wait.
+        Nodes of one process take turns: where one of them sends diagnostics, the others only wait.
         """
-        now, (news, self._news) = time.monotonic(), (self._news, [])
-        if now - max(self._heard.values(), default=0.0) < 0.5 * SILENT:
-            spoke: dict[str, float] = {}
-            for name, heard in self._heard.items():
+        now, (events, self._node_events) = time.monotonic(), (self._node_events, [])
+        if now - max(self._last_message.values(), default=0.0) < 0.5 * SILENCE_TIMEOUT:
+            last_of_process: dict[str, float] = {}
+            for name, received in self._last_message.items():
                 process = self.processes.get(name, name)
-                spoke[process] = max(heard, spoke.get(process, 0.0))
-            silent = {name for name in self._heard if now - spoke[self.processes.get(name, name)] > SILENT}
-            news += [f"{name} has been silent for {SILENT:g} s" for name in sorted(silent - self._silent)]
+                last_of_process[process] = max(received, last_of_process.get(process, 0.0))
+            silent = {name for name in self._last_message if now - last_of_process[self.processes.get(name, name)] > SILENCE_TIMEOUT}
+            events += [f"{name} has sent no diagnostics for {SILENCE_TIMEOUT:g} s" for name in sorted(silent - self._silent)]
             self._silent = silent
-        return news
+        return events
 
     def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
-            check: Callable[[], None] = lambda: None, stall: float = STALL) -> FlightResult:
+            check: Callable[[], None] = lambda: None, stall_timeout: float = STALL_TIMEOUT) -> FlightResult:
         """Send the goal and wait for its end; when it has been under way for the scenario's time limit it is cancelled.
 
         Args:
             scenario: what to fly.
-            on_phase: receives (simulation time [s], phase, message) when the phase or its message changes, when a node falls silent or
-                was restarted, and who is waited for when simulation time stands still.
+            on_phase: receives (simulation time [s], phase, message) when the phase or its message changes, when a node stops sending
+                diagnostics or was restarted, and who is waited for when simulation time has stopped.
             check: called often; may raise to end the wait (a node that died).
-            stall: wall-clock time without progress of simulation time after which the flight has failed [s].
+            stall_timeout: wall-clock time without progress of simulation time after which the flight has failed [s].
 
         Raises:
-            PerchError: the mission does not answer, refuses the goal, is gone, or does not end a cancelled one; simulation time stands still.
+            PerchError: the mission does not answer, refuses the goal, is gone, or does not end a cancelled one; simulation time has stopped.
         """
-        seen = ("", "")
+        reported = ("", "")
 
         def feedback(msg: Any) -> None:
-            nonlocal seen
+            nonlocal reported
             now = (msg.feedback.phase, msg.feedback.message)
-            if now != seen:
-                seen = now
+            if now != reported:
+                reported = now
                 on_phase(self.time, *now)
 
-        self._spin_until(self._client.server_is_ready, check, START_PATIENCE, "the mission's action server does not appear")
+        self._spin_until(self._client.server_is_ready, check, START_TIMEOUT, "the mission's action server does not appear")
         for node, service in SERVICES.items():
             if node in scenario.nodes:
                 offered = partial(self.node.count_services, self.node.resolve_service_name(service))
-                self._spin_until(offered, check, START_PATIENCE, f"{node} does not offer {service}")
+                self._spin_until(offered, check, START_TIMEOUT, f"{node} does not offer {service}")
         progress, servers = _Progress(self.time), self._servers()
         sent = self._client.send_goal_async(goal_message(goal_of(scenario)), feedback_callback=feedback)
 
         def answered() -> bool:
-            self._look_around(servers, scenario.nodes)
+            self._check_graph(servers, scenario.nodes)
             return bool(sent.done())
 
-        self._spin_until(answered, check, stall, "the mission does not answer to the goal")
+        self._spin_until(answered, check, stall_timeout, "the mission does not answer the goal request")
         handle = sent.result()
         if not handle.accepted:
             raise PerchError("the mission refused the goal: it is flying another one")
@@ -163,16 +163,16 @@ class MissionClient(GraphNode):
         while not result.done():
             self.spin(0.05)
             check()
-            for words in self.news():
-                on_phase(self.time, seen[0], words)
-            self._look_around(servers, scenario.nodes)
-            still = progress.look(self.time)
-            if progress.explain():
-                on_phase(self.time, "waiting", f"simulation time stands still: {self._whom()}")
-            if still > (stall if self.time > 0.0 else START_PATIENCE):
-                raise PerchError(f"simulation time has stood still at {self.time:.3f} s for {still:.0f} s: {self._whom()}")
-            if self.time - cancelled > CANCEL_PATIENCE:
-                raise PerchError(f"the mission has not ended the goal in {CANCEL_PATIENCE:g} s since it was cancelled")
+            for text in self.node_events():
+                on_phase(self.time, reported[0], text)
+            self._check_graph(servers, scenario.nodes)
+            stopped = progress.update(self.time)
+            if progress.should_explain():
+                on_phase(self.time, "waiting", f"simulation time has stopped: {self._waiting_text()}")
+            if stopped > (stall_timeout if self.time > 0.0 else START_TIMEOUT):
+                raise PerchError(f"simulation time has been stopped at {self.time:.3f} s for {stopped:.0f} s: {self._waiting_text()}")
+            if self.time - cancelled > CANCEL_TIMEOUT:
+                raise PerchError(f"the mission has not ended the goal in {CANCEL_TIMEOUT:g} s since it was cancelled")
             if self.time - progress.start > scenario.time_limit and cancelled == math.inf:
                 cancelled = self.time
                 on_phase(self.time, "cancelling", f"time limit of {scenario.time_limit:g} s reached")
@@ -190,21 +190,21 @@ class MissionClient(GraphNode):
             check: called often; may raise to end the wait.
 
         Returns:
-            Whether it hovers, and the mission's words.
+            Whether it hovers, and the mission's message.
 
         Raises:
             PerchError: the mission does not answer.
         """
         client = self.node.create_client(Trigger, "depart")
         try:
-            self._spin_until(client.service_is_ready, check, STALL, "the mission does not offer depart")
+            self._spin_until(client.service_is_ready, check, STALL_TIMEOUT, "the mission does not offer depart")
             answer = client.call_async(Trigger.Request())
-            self._spin_until(answer.done, check, STALL, "the mission does not answer to depart")
+            self._spin_until(answer.done, check, STALL_TIMEOUT, "the mission does not answer the request to depart")
             return answer.result().success, answer.result().message
         finally:
             self.node.destroy_client(client)
 
-    def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 30.0) -> None:
+    def linger(self, duration: float, check: Callable[[], None] = lambda: None, timeout: float = 30.0) -> None:
         """Let simulation time go on for a while, so that the recording shows the rest."""
         end = self.time + duration
 
@@ -212,7 +212,7 @@ class MissionClient(GraphNode):
             check()
             return self.time >= end
 
-        self.spin_until(over, patience)
+        self.spin_until(over, timeout)
 
     def close(self) -> None:
         """Leave the graph."""
@@ -220,23 +220,23 @@ class MissionClient(GraphNode):
         super().close()
 
     def _servers(self) -> set[bytes]:
-        """Who carries out goals."""
+        """The action servers of `perch`."""
         topic = f"{self.node.resolve_service_name('perch')}/_action/status"
         return {bytes(info.endpoint_gid) for info in self.node.get_publishers_info_by_topic(topic)}
 
-    def _look_around(self, servers: set[bytes], nodes: Collection[str]) -> None:
-        """A result comes from the process that took the goal, or never; a node of the scenario that is there must be heard from then on."""
-        if time.monotonic() - self._looked < LOOK:
+    def _check_graph(self, servers: set[bytes], nodes: Collection[str]) -> None:
+        """A result comes from the process that took the goal, or never; a discovered node of the scenario must send diagnostics from then on."""
+        if time.monotonic() - self._last_check < CHECK_PERIOD:
             return
-        self._looked = time.monotonic()
+        self._last_check = time.monotonic()
         for name in self.nodes() & {self._vehicle.removesuffix("vehicle") + node for node in nodes}:
-            self._heard.setdefault(name, self._looked)
+            self._last_message.setdefault(name, self._last_check)
         now = self._servers()
         if servers and (not now or now - servers):
-            raise PerchError(f"the mission {'was restarted' if now else 'has ended'}: the goal is lost")
+            raise PerchError(f"the mission {'was restarted' if now else 'has ended'}: its goal was dropped")
 
-    def _whom(self) -> str:
-        return f"waiting for {self.waiting_for}" if self.waiting_for else f"{self._vehicle} does not say why"
+    def _waiting_text(self) -> str:
+        return f"waiting for {self.waiting_for}" if self.waiting_for else f"{self._vehicle} reports no reason"
 
     def _spin_until(self, done: Callable[[], object], check: Callable[[], None], timeout: float, problem: str) -> None:
         def over() -> object:
@@ -252,9 +252,9 @@ class MissionClient(GraphNode):
 
     def _receive_diagnostics(self, msg: DiagnosticArray) -> None:
         for status in msg.status:
-            self._heard[status.name] = time.monotonic()
+            self._last_message[status.name] = time.monotonic()
             if self.processes.setdefault(status.name, status.hardware_id) != status.hardware_id:
                 self.processes[status.name] = status.hardware_id
-                self._news.append(f"{status.name} was restarted")
+                self._node_events.append(f"{status.name} was restarted")
             if status.name == self._vehicle:
                 self.waiting_for = next((pair.value for pair in status.values if pair.key == "waiting_for"), "")

@@ -25,7 +25,7 @@ class RecordedFlight(Flight):
             namespace: of the vehicle, where several were recorded.
         """
         prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
-        self._undecoded: dict[str, tuple[str, list[tuple[int, bytes]]]] = {}  # channel and messages that nobody has asked for
+        self._undecoded: dict[str, tuple[str, list[tuple[int, bytes]]]] = {}  # channel and messages that have not been requested
         damage: list[str] = []
         for topic, type_of, time, data in read(path, on_damage=damage.append):
             key = topic.removeprefix(prefix).lstrip("/")

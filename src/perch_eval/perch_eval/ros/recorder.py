@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perch_core.component import Diagnostics, LogLine, Wake
+from perch_core.component import Diagnostics, LogLine, Timer
 from perch_core.config import quantity, text
 from perch_core.values import NANOSECONDS, CameraImage, CompressedPixels, Serialized
 from perch_eval.mcap_log import McapLog
 from perch_eval.ros.definitions import schema_of
-from perch_eval.ros.listener import Listener, listening
+from perch_eval.ros.listener import Listener, subscribed_to
 
 CHANNELS = (
     "ground_truth/odometry", "ground_truth/target", "contact", "imu/data_raw", "rotor_state", "motor_command",
@@ -31,22 +31,22 @@ class RecorderParameters:
     image_quality: int = quantity(80, unit="%", low=10, high=100, doc="JPEG quality")
 
 
-@listening(CHANNELS)
+@subscribed_to(CHANNELS)
 class Recorder(Listener[RecorderParameters]):
-    """Keeps messages as they are on the wire with simulation time, and some of the images as JPEG.
+    """Records serialised messages with simulation time, and some of the images as JPEG.
 
     A file that cannot be written ends the recording with one line of log, and never the flight.
     """
 
     config_type = RecorderParameters
 
-    flush = Wake(0.1)
+    flush = Timer(0.1)
 
     def __init__(self, config: RecorderParameters) -> None:
         super().__init__(config)
         self._log: McapLog | None = None
         self._last_image: dict[str, int] = {}
-        self._messages, self._told = 0, -NANOSECONDS
+        self._messages, self._last_report = 0, -NANOSECONDS
         self._failure = ""
 
     def warm_up(self) -> None:
@@ -54,7 +54,7 @@ class Recorder(Listener[RecorderParameters]):
         try:
             self._log = McapLog(Path(self.config.file))
         except OSError as error:
-            self._give_up(error)
+            self._stop_recording(error)
 
     def on_message(self, channel: str, message: Serialized) -> None:
         """Put a message on file."""
@@ -73,14 +73,14 @@ class Recorder(Listener[RecorderParameters]):
             self._write(self.serialized(f"camera_{camera}/image_raw/compressed", packed))
 
     def on_flush(self, now: int) -> None:
-        """Hand to the operating system what is finished, and tell how it goes."""
+        """Hand to the operating system what is finished, and publish diagnostics."""
         if self._log is not None:
             try:
                 self._log.flush()
             except OSError as error:
-                self._give_up(error)
-        if now - self._told >= NANOSECONDS:
-            self._told = now
+                self._stop_recording(error)
+        if now - self._last_report >= NANOSECONDS:
+            self._last_report = now
             level, message = (2, self._failure) if self._failure else (0, "ok")
             self.diagnostics(Diagnostics(self.newest, {"messages": self._messages}, level, message))
 
@@ -91,7 +91,7 @@ class Recorder(Listener[RecorderParameters]):
             try:
                 log.close()
             except OSError as error:
-                self._give_up(error)
+                self._stop_recording(error)
 
     def _write(self, message: Serialized) -> None:
         if self._log is None:
@@ -100,9 +100,9 @@ class Recorder(Listener[RecorderParameters]):
             self._log.write(message.topic, schema_of(message.message), message.data, message.stamp)
             self._messages += 1
         except OSError as error:
-            self._give_up(error)
+            self._stop_recording(error)
 
-    def _give_up(self, error: OSError) -> None:
+    def _stop_recording(self, error: OSError) -> None:
         log, self._log = self._log, None
         if log is not None:
             log.abandon()

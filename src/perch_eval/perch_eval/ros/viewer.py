@@ -1,4 +1,4 @@
-"""Component `viewer`: serves the running flight to Foxglove by WebSocket, with markers of what a person wants to see."""
+"""Component `viewer`: serves the running flight to Foxglove by WebSocket, with markers of the scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perch_core.values import NANOSECONDS, AtEnd, CameraImage, Marker, Markers, 
 from perch_core.vehicle import load_vehicle
 from perch_eval.extras import require
 from perch_eval.ros.definitions import schema_of
-from perch_eval.ros.listener import CAMERAS, Listener, listening
+from perch_eval.ros.listener import CAMERAS, Listener, subscribed_to
 from perch_eval.ros.recorder import jpeg
 from perch_eval.view.scene import (
     Path, map_markers, path_markers, plan_markers, target_markers, truth_markers, vehicle_markers, world_markers)
@@ -23,14 +23,14 @@ RARE = (
     "ground_truth/target", "contact", "rotor_state", "vio/odometry", "estimator/status", "target/pose", "target/detections", "powerlines",
     "trajectory", "controller/status", "controller/reference", *(f"camera_{camera}/camera_info" for camera in CAMERAS), "/tf_static",
     "robot_description")
-PASSING = ("/diagnostics", "/tf")  # of which the last message is nothing to who comes later
-KEPT = {"/tf_static": 100, "contact": 100}
-"""Messages kept for who comes later, where it is more than the last one."""
+UNLATCHED = ("/diagnostics", "/tf")  # of which later subscribers do not get the last message
+LATCHED_DEPTH = {"/tf_static": 100, "contact": 100}
+"""Number of messages kept for later subscribers, where it is more than one."""
 MARKERS = "markers"
 RATE, SCENE_RATE, IMAGE_RATE = 50.0, 20.0, 10.0
-"""Messages of the 500 Hz topics, markers, and images of a camera while somebody looks, per second of simulation [Hz]."""
+"""Messages of the 500 Hz topics, markers, and images of a subscribed camera, per second of simulation [Hz]."""
 IMAGE_QUALITY = 75  # of JPEG [%]
-SLOW_SCENE = 5  # what does not move is sent with every so many scenes: whoever comes late sees it too
+SLOW_SCENE = 5  # what does not move is sent with every so many scenes: later subscribers get it, too
 LOCAL = (
     "http://localhost", "https://localhost", "http://127.0.0.1", "https://127.0.0.1", "http://[::1]", "file://", "https://app.foxglove.dev")
 
@@ -42,7 +42,8 @@ class ViewerParameters:
     scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file: vehicle, room, surface, cables")
     host: str = text("127.0.0.1", doc="address that is served; 0.0.0.0: to every machine that reaches this one")
     port: int = quantity(8765, low=0, high=65535, doc="of the WebSocket, 0: any free one")
-    origins: tuple[str, ...] = text(LOCAL, doc="web pages that may look, as scheme://host[:port], *: all; what is no browser always may")
+    origins: tuple[str, ...] = text(
+        LOCAL, doc="web pages that may connect, as scheme://host[:port], *: all; programs that are no browsers always may")
 
 
 class _Pace:
@@ -59,7 +60,7 @@ class _Pace:
         return True
 
 
-@listening((*FAST, *RARE, *PASSING))
+@subscribed_to((*FAST, *RARE, *UNLATCHED))
 class Viewer(Listener[ViewerParameters]):
     """Passes messages on as they are on the wire, and draws the scene."""
 
@@ -81,7 +82,7 @@ class Viewer(Listener[ViewerParameters]):
         self._map: list[Marker] = []
         self._mapped: set[int] = set()
         self._truth = b""
-        self._words = ""
+        self._status = ""
         self._flown, self._true_path = Path(), Path()
         self._scene_pace, self._scenes = _Pace(SCENE_RATE), 0
         self._paces = {channel: _Pace(RATE) for channel in FAST}
@@ -92,7 +93,7 @@ class Viewer(Listener[ViewerParameters]):
         self.server = LiveServer(config.host, config.port, f"perch: {scenario.name}", config.origins)
 
     def warm_up(self) -> None:
-        """Tell where to look."""
+        """Log the address that is served."""
         self.info(f"ws://{self.config.host}:{self.server.port}")
 
     def on_message(self, channel: str, message: Serialized) -> None:
@@ -100,18 +101,18 @@ class Viewer(Listener[ViewerParameters]):
         message = self.serialized(channel, message)
         pace = self._paces.get(channel)
         if pace is None or pace(message.stamp):
-            self._send(message, KEPT.get(channel, channel in RARE))
+            self._send(message, LATCHED_DEPTH.get(channel, channel in RARE))
         try:
-            self._see(channel, message)
+            self._update_scene(channel, message)
         except PerchError as error:
-            self.warn(f"{channel} is not drawn: {error}", every=1.0)
+            self.warn(f"{channel} is not drawn: {error}", min_interval=1.0)
 
     def on_image(self, camera: str, image: CameraImage) -> None:
-        """Pass an image on while somebody looks."""
+        """Pass an image on if it has subscribers."""
         channel = f"camera_{camera}/image_raw/compressed"
         topic = self.resolve(channel)
         self._declare(topic, topics.message_type(channel))
-        if not self._image_paces[camera](image.stamp) or not self.server.watched(topic):
+        if not self._image_paces[camera](image.stamp) or not self.server.has_subscribers(topic):
             return
         packed = jpeg(image, IMAGE_QUALITY)
         if packed is not None:
@@ -129,8 +130,8 @@ class Viewer(Listener[ViewerParameters]):
         self._declare(message.topic, message.message)
         self.server.send(message.topic, message.data, message.stamp, keep)
 
-    def _see(self, channel: str, message: Serialized) -> None:
-        """Keep what the scene is made of; odometry draws it."""
+    def _update_scene(self, channel: str, message: Serialized) -> None:
+        """Update the content of the scene; odometry draws it."""
         if channel == "odometry" and self._scene_pace(message.stamp):
             self._draw(topics.decode(channel, message.data))
         elif channel == "ground_truth/odometry":
@@ -146,12 +147,12 @@ class Viewer(Listener[ViewerParameters]):
             self._mapped |= {line.id for line in lines.lines}
             self._map = map_markers(lines, self._mapped)
         elif channel == "controller/status":
-            self._words = topics.decode(channel, message.data).message
+            self._status = topics.decode(channel, message.data).message
 
     def _draw(self, state: OdometryState) -> None:
         """Send the scene with the vehicle at a state."""
         self._flown.add(state.p_WB)
-        found = vehicle_markers(self._vehicle, state, self._words)
+        found = vehicle_markers(self._vehicle, state, self._status)
         if self._truth:
             truth = topics.decode("ground_truth/odometry", self._truth)
             self._true_path.add(truth.p_WB)
@@ -162,4 +163,4 @@ class Viewer(Listener[ViewerParameters]):
         scene = Markers(state.stamp, tuple(found))
         self.markers(scene)
         self._send(self.serialized(MARKERS, scene))
-        self.server.tell_time(state.stamp)
+        self.server.broadcast_time(state.stamp)

@@ -1,9 +1,8 @@
-"""A door in front of a WebSocket server that accepts every web page: it lets in those whose origin is known.
+"""A proxy in front of a WebSocket server that accepts every web page: it admits those with an allowed origin.
 
-Browsers let any page open a WebSocket to this machine and tell the server the page's origin; programs that are no browsers tell
-none. Foxglove's server does not look at it, so that any page a user visits could read the flight. It listens at a random address
-of the loopback network (127.0.0.0/8) and a random port, 39 bits that no page can guess in time, and this door at the address that
-people know.
+Browsers let any page open a WebSocket to this machine and send the page's origin; programs that are no browsers send none.
+Foxglove's server does not check it, so that any page a user visits could read the flight. It listens at a random address of the
+loopback network (127.0.0.0/8) and a random port, 39 bits that no page can guess in time, and this proxy at the public address.
 """
 
 from __future__ import annotations
@@ -47,11 +46,11 @@ def hidden_host() -> str:
 
 
 def allowed(origin: str | None, origins: Iterable[str]) -> bool:
-    """Whether a page of an origin may look.
+    """Whether a page of an origin may connect.
 
     Args:
         origin: as in the handshake, `scheme://host[:port]`; None: no browser.
-        origins: those that may; without a port every port of the host, `*` everybody.
+        origins: the allowed ones; without a port every port of the host, `*` all.
     """
     if origin is None:
         return True
@@ -79,20 +78,20 @@ def _port(origin: str) -> int | None:
 class Gate:
     """Listens at an address and passes connections of allowed origins on."""
 
-    def __init__(self, host: str, port: int, behind: tuple[str, int], origins: Iterable[str]) -> None:
+    def __init__(self, host: str, port: int, backend: tuple[str, int], origins: Iterable[str]) -> None:
         """
         Args:
             host, port: address that is served; port 0: any free one.
-            behind: address of the server behind.
-            origins: who may look, see `allowed`.
+            backend: address of the server.
+            origins: of web pages that may connect, see `allowed`.
 
         Raises:
             OSError: the address cannot be served.
         """
-        self._behind, self._origins = behind, tuple(origins)
+        self._backend, self._origins = backend, tuple(origins)
         self._loop = asyncio.new_event_loop()
         try:
-            self._server = self._loop.run_until_complete(asyncio.start_server(self._enter, host, port, limit=HEADER_MAX))
+            self._server = self._loop.run_until_complete(asyncio.start_server(self._handle_connection, host, port, limit=HEADER_MAX))
         except BaseException:
             self._loop.close()
             raise
@@ -105,7 +104,7 @@ class Gate:
         return self._server.sockets[0].getsockname()[1]
 
     def close(self) -> None:
-        """Let nobody in any more, and end the connections that the server behind has not ended."""
+        """Accept no more connections, and end those that the server has not ended."""
         asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(timeout=5.0)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(timeout=5.0)
@@ -120,7 +119,7 @@ class Gate:
             task.cancel()
         await asyncio.gather(*late, return_exceptions=True)
 
-    async def _enter(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _handle_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         inner: asyncio.StreamWriter | None = None
         try:
             header = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HANDSHAKE_TIME)
@@ -128,9 +127,9 @@ class Gate:
                 writer.write(REFUSAL)
                 await writer.drain()
                 return
-            from_inner, inner = await asyncio.open_connection(*self._behind)
+            from_inner, inner = await asyncio.open_connection(*self._backend)
             inner.write(header)
-            await asyncio.gather(_pass_on(reader, inner), _pass_on(from_inner, writer))
+            await asyncio.gather(_forward(reader, inner), _forward(from_inner, writer))
         except (TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, asyncio.CancelledError):
             pass  # no handshake, or the end of a connection
         finally:
@@ -145,7 +144,7 @@ def _origin(header: bytes) -> str | None:
     return (found[0] if len(found) == 1 else "null") if found else None
 
 
-async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def _forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     """Bytes of one direction until its end, as fast as they are taken."""
     while data := await reader.read(CHUNK):
         writer.write(data)

@@ -1,4 +1,4 @@
-"""What a person wants to see of a flight, as markers in `map`: vehicle, pad, cables, planned and flown path, waypoints."""
+"""The scene of a flight as markers in `map`: vehicle, pad, cables, planned and flown path, waypoints."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ ESTIMATE, TRUTH, PLANNED, FOUND = (1.0, 0.6, 0.1, 1.0), (0.3, 0.6, 0.9, 1.0), (0
 ROOM, SURFACE, PAD, GHOST = (0.6, 0.6, 0.6, 0.4), (0.55, 0.55, 0.55, 0.5), (0.95, 0.95, 0.95, 1.0), (0.3, 0.6, 0.9, 0.35)
 CABLES = {"red": (0.75, 0.1, 0.1, 1.0), "grey": (0.45, 0.45, 0.45, 1.0)}
 ROTORS = ((0.9, 0.2, 0.2, 0.8), (0.25, 0.25, 0.25, 0.8), (0.25, 0.25, 0.25, 0.8), (0.9, 0.2, 0.2, 0.8))  # the front ones are red
-WORD = (1.0, 1.0, 1.0, 1.0)
+TEXT_COLOUR = (1.0, 1.0, 1.0, 1.0)
 PLAN_STEP = 0.02     # between drawn points of a plan [s]
 PATH_STEP = 0.02     # least distance between drawn points of a flown path [m]
 PATH_POINTS = 3000   # of a flown path; then every other one is dropped
-SIGHT = 0.4          # length of the camera's axis [m]
+CAMERA_AXIS_LENGTH = 0.4  # [m]
 
 
 def _floats(values: Iterable[float]) -> Floats:
@@ -100,12 +100,12 @@ def world_markers(scenario: Scenario) -> list[Marker]:
         out.append(polyline("waypoints", 0, PLANNED, 0.01, points))
         for k, p in enumerate(points):
             out += [marker(Shape.SPHERE, "waypoints", 2 * k + 1, PLANNED, (0.08, 0.08, 0.08), p),
-                    label("waypoints", 2 * k + 2, WORD, 0.15, (p[0], p[1], p[2] + 0.15), str(k + 1))]
+                    label("waypoints", 2 * k + 2, TEXT_COLOUR, 0.15, (p[0], p[1], p[2] + 0.15), str(k + 1))]
     return out
 
 
-def vehicle_markers(vehicle: Vehicle, state: OdometryState, words: str) -> list[Marker]:
-    """The vehicle where the estimator has it: rotors (the front ones red), thrust axis, camera axis, words above it."""
+def vehicle_markers(vehicle: Vehicle, state: OdometryState, text: str) -> list[Marker]:
+    """The vehicle where the estimator has it: rotors (the front ones red), thrust axis, camera axis, text above it."""
     p, R = np.array(state.p_WB), so3.quat_to_matrix(np.array(state.q_WB))
     hubs = [p + R @ np.array([x, y, 0.0]) for x, y in vehicle.rotor_xy]
     out = [polyline("vehicle", 0, ESTIMATE, 0.02, [hubs[0], hubs[2], hubs[1], hubs[3]], pieces=True)]
@@ -116,8 +116,8 @@ def vehicle_markers(vehicle: Vehicle, state: OdometryState, words: str) -> list[
     mount = vehicle.mounts.get("front")
     if mount is not None:
         eye = p + R @ mount.p_BC
-        out.append(arrow("camera_axis", 0, PLANNED, eye, eye + SIGHT * R @ mount.R_BC[:, 2]))
-    out.append(label("status", 0, WORD, 0.12, p + (0.0, 0.0, 0.35), words))
+        out.append(arrow("camera_axis", 0, PLANNED, eye, eye + CAMERA_AXIS_LENGTH * R @ mount.R_BC[:, 2]))
+    out.append(label("status", 0, TEXT_COLOUR, 0.12, p + (0.0, 0.0, 0.35), text))
     return out
 
 

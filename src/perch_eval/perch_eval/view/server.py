@@ -19,15 +19,15 @@ class LiveServer(foxglove.websocket.ServerListener):
         """
         Args:
             host, port: address that is served; port 0: any free one.
-            name: shown to who looks.
-            origins: of web pages that may look, see `perch_eval.view.gate.allowed`.
+            name: shown to clients.
+            origins: of web pages that may connect, see `perch_eval.view.gate.allowed`.
 
         Raises:
             ConfigError: the port is taken, or the address is none of this machine's.
         """
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
-        self._kept: dict[str, deque[tuple[bytes, int]]] = {}  # topic -> its last messages, for those who come later
+        self._latched: dict[str, deque[tuple[bytes, int]]] = {}  # topic -> its last messages, for later subscribers
         hidden = hidden_host()
         self._server = foxglove.start_server(name=name, host=hidden, port=0, context=self._context, server_listener=self,
                                              capabilities=[foxglove.Capability.Time])
@@ -51,26 +51,26 @@ class LiveServer(foxglove.websocket.ServerListener):
         described = foxglove.Schema(name=schema.name, encoding="ros2msg", data=schema.definition.encode())
         self._channels[topic] = foxglove.Channel(topic, message_encoding="cdr", schema=described, context=self._context)
 
-    def watched(self, topic: str) -> bool:
-        """Somebody looks at the topic."""
+    def has_subscribers(self, topic: str) -> bool:
+        """Whether the topic has subscribers."""
         return self._channels[topic].has_sinks()
 
     def send(self, topic: str, data: bytes, time: int, keep: int = 0) -> None:
-        """Send one serialised message; `time` is simulation time [ns]. The last `keep` ones are sent again to who subscribes later."""
+        """Send one serialised message; `time` is simulation time [ns]. The last `keep` ones are sent again to later subscribers."""
         if keep:
-            self._kept.setdefault(topic, deque(maxlen=keep)).append((data, time))
+            self._latched.setdefault(topic, deque(maxlen=keep)).append((data, time))
         self._channels[topic].log(data, log_time=time)
 
     def on_subscribe(self, client: foxglove.websocket.Client, channel: foxglove.websocket.ChannelView) -> None:
-        """Somebody begins to look; called by the server's thread."""
-        for data, time in tuple(self._kept.get(channel.topic, ())):
+        """Send the kept messages to a new subscriber; called by the server's thread."""
+        for data, time in tuple(self._latched.get(channel.topic, ())):
             self._channels[channel.topic].log(data, log_time=time)
 
-    def tell_time(self, time: int) -> None:
-        """Tell simulation time [ns]."""
+    def broadcast_time(self, time: int) -> None:
+        """Send simulation time [ns]."""
         self._server.broadcast_time(time)
 
     def close(self) -> None:
-        """Say goodbye to everybody who looks."""
+        """End all connections."""
         self._server.stop()
         self._gate.close()

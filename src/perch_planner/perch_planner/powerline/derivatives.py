@@ -21,14 +21,14 @@ STRIDE = STAGE_STATES + INPUTS
 
 @dataclass(frozen=True)
 class Parameters:
-    """The problem's parameters as symbols: see `nlp.Numbers`."""
+    """The problem's parameters as symbols: see `nlp.ProblemData`."""
 
     lines: Sequence[ca.MX]
     body_rate: ca.MX
     reference: ca.MX
     run: ca.MX
     end: ca.MX
-    see: ca.MX
+    perception: ca.MX
 
 
 class Gather:
@@ -60,14 +60,14 @@ class Gather:
         """The matrix; values at the same place are added up."""
         rows, columns, source = map(np.concatenate, (self._rows, self._columns, self._source))
         sparsity, mapping = ca.Sparsity.triplet(*self._shape, rows.tolist(), columns.tolist(), False)
-        everything = ca.vertcat(*self._parts)
+        all_values = ca.vertcat(*self._parts)
         if sparsity.nnz() == len(rows):
-            return ca.MX(sparsity, everything[source[np.array(mapping)].tolist()])
+            return ca.MX(sparsity, all_values[source[np.array(mapping)].tolist()])
         # Several values at one place: a constant matrix of ones adds them, cheaper than a chain of sparse sums.
         place = {cell: k for k, cell in enumerate(zip(*[np.array(v) for v in sparsity.get_triplet()]))}
         target = [place[cell] for cell in zip(rows, columns)]
         adder = ca.DM.triplet(target, source.tolist(), ca.DM.ones(len(rows)), sparsity.nnz(), self._length)
-        return ca.MX(sparsity, ca.mtimes(adder, everything))
+        return ca.MX(sparsity, ca.mtimes(adder, all_values))
 
 
 def _pattern(sparsity: ca.Sparsity) -> tuple[np.ndarray, np.ndarray]:
@@ -95,7 +95,7 @@ class Rows:
     Attributes:
         dynamics: first of 18 rows of every interval, shape (N,).
         start: first of 17 rows of the start condition.
-        turn: row of the middle of every interval, shape (N,).
+        between: row of the middle of every interval, shape (N,).
         inner: first row of the path constraints of nodes 1..N, shape (N,).
         end: first row of the values that vanish at the last node.
         count: number of all rows.
@@ -103,7 +103,7 @@ class Rows:
 
     dynamics: np.ndarray
     start: int
-    turn: np.ndarray
+    between: np.ndarray
     inner: np.ndarray
     end: int
     count: int
@@ -112,15 +112,15 @@ class Rows:
 def constraint_rows(N: int, path: int, end: int) -> Rows:
     """Rows of a problem with N intervals, `path` constraints at every node but the first, and `end` more at the last."""
     first = STAGE_STATES + STATES + 1
-    later = first + np.arange(N - 1) * (STAGE_STATES + path + 1)
-    inner = np.append(later + STAGE_STATES, first + (N - 1) * (STAGE_STATES + path + 1))
+    following = first + np.arange(N - 1) * (STAGE_STATES + path + 1)
+    inner = np.append(following + STAGE_STATES, first + (N - 1) * (STAGE_STATES + path + 1))
     last = int(inner[-1]) + path
-    return Rows(np.append(0, later), STAGE_STATES, np.append(first - 1, inner[:-1] + path), inner, last, last + end)
+    return Rows(np.append(0, following), STAGE_STATES, np.append(first - 1, inner[:-1] + path), inner, last, last + end)
 
 
 def path_functions(p: Parameters) -> list[tuple[str, ca.MX]]:
-    """The path constraints of a node in their order, each with its parameter: every line's clearance, then the spin."""
-    return [*(("clear", line) for line in p.lines), ("spin", p.body_rate)]
+    """The path constraints of a node in their order, each with its parameter: every line's clearance, then the body rate."""
+    return [*(("clearance", line) for line in p.lines), ("body_rate", p.body_rate)]
 
 
 def end_size(stages: StageFunctions, end: str) -> int:
@@ -142,9 +142,9 @@ def jacobian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, end: str) 
     diagonal = np.arange(STAGE_STATES)
     out.add(ca.MX(ca.DM.ones(N * STAGE_STATES)), (at.dynamics[:, None] + diagonal).ravel(), ((k + 1) * STRIDE + diagonal).ravel())
     out.add(ca.MX(ca.DM.ones(STATES)), at.start + np.arange(STATES), np.arange(STATES))
-    rows, columns = _pattern(stages.jacobian["turn"])
-    values = f["turn_jac"].map(N)(X[:, :N], U, 1.0 / N, p.body_rate)
-    out.add(ca.vec(values), (at.turn[:, None] + rows).ravel(), (k * STRIDE + columns).ravel())
+    rows, columns = _pattern(stages.jacobian["body_rate_between"])
+    values = f["body_rate_between_jac"].map(N)(X[:, :N], U, 1.0 / N, p.body_rate)
+    out.add(ca.vec(values), (at.between[:, None] + rows).ravel(), (k * STRIDE + columns).ravel())
     for i, (name, parameter) in enumerate(path):
         rows, columns = _pattern(stages.jacobian[name])
         values = f[f"{name}_jac"].map(N)(X[:, 1:], parameter)
@@ -165,24 +165,24 @@ def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.M
     out = Gather(size, size)
     pieces: list[tuple[ca.MX, int]] = []  # gradients of one function over the stages, and the first stage
 
-    def take(name: str, values: ca.MX, variables: int, first: int, number: int) -> None:
+    def add_terms(name: str, values: ca.MX, variables: int, first: int, number: int) -> None:
         pieces.append((values[:variables, :], first))
         places = _tiled(_pattern(stages.hessian[name]), STRIDE, STRIDE, number, first * STRIDE, first * STRIDE)
         out.add(ca.vec(values[variables:, :]), *places, mirror=True)
 
     lam_step = ca.reshape(lam_g[(at.dynamics[:, None] + np.arange(STAGE_STATES)).ravel().tolist()], STAGE_STATES, N)
-    take("step", f["step_hess"].map(N)(X[:, :N], U, 1.0 / N, -lam_step), STRIDE, 0, N)
-    turn = f["turn_hess"].map(N)(X[:, :N], U, 1.0 / N, p.body_rate, lam_g[at.turn.tolist()].T)
-    take("turn", turn, STRIDE, 0, N)
-    take("run", f["run_hess"].map(N)(X[:, :N], U, 1.0 / N, p.run, lam_f), STRIDE, 0, N)
+    add_terms("step", f["step_hess"].map(N)(X[:, :N], U, 1.0 / N, -lam_step), STRIDE, 0, N)
+    between = f["body_rate_between_hess"].map(N)(X[:, :N], U, 1.0 / N, p.body_rate, lam_g[at.between.tolist()].T)
+    add_terms("body_rate_between", between, STRIDE, 0, N)
+    add_terms("run", f["run_hess"].map(N)(X[:, :N], U, 1.0 / N, p.run, lam_f), STRIDE, 0, N)
     if perception:
-        take("see", f["see_gauss_newton" if gauss_newton else "see_hess"].map(N)(X[:, :N], p.lines[0], p.see, lam_f), STAGE_STATES, 0, N)
+        add_terms("perception", f["perception_gauss_newton" if gauss_newton else "perception_hess"].map(N)(X[:, :N], p.lines[0], p.perception, lam_f), STAGE_STATES, 0, N)
     for i, (name, parameter) in enumerate(path):
         values = f[f"{name}_hess"].map(N)(X[:, 1:], parameter, lam_g[(at.inner + i).tolist()].T)
-        take(name, values, STAGE_STATES, 1, N)
-    take("end", f["end_hess"](X[:, N], p.reference, p.end, lam_f), STAGE_STATES, N, 1)
+        add_terms(name, values, STAGE_STATES, 1, N)
+    add_terms("end", f["end_hess"](X[:, N], p.reference, p.end, lam_f), STAGE_STATES, N, 1)
     if end:
-        take(end, f[f"{end}_hess"](X[:, N], p.reference, lam_g[at.end:]), STAGE_STATES, N, 1)
+        add_terms(end, f[f"{end}_hess"](X[:, N], p.reference, lam_g[at.end:]), STAGE_STATES, N, 1)
 
     gradient = ca.MX.zeros(STRIDE, N + 1)
     for values, first in pieces:

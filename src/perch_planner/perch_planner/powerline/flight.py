@@ -24,7 +24,7 @@ def _chain(model: RotorModel, steps: int) -> ca.Function:
     return _flow(model).mapaccum(f"chain{steps}", steps)
 
 
-def fly(model: RotorModel, start: np.ndarray, rates: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulate(model: RotorModel, start: np.ndarray, rates: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Integrate the model under piecewise constant thrust rates.
 
     Args:

@@ -1,4 +1,4 @@
-"""Formulation of the nonlinear program of [P:eq14]: weights and end conditions, ours and those of the paper's authors."""
+"""Formulation of the nonlinear program of [P:eq14]: weights and end conditions, the default ones and those of the paper's authors."""
 
 from __future__ import annotations
 
@@ -46,6 +46,6 @@ class Formulation:
     accuracy: tuple[float, float, float] = (0.001, 0.1, 0.02)
 
 
-OURS = Formulation()
-PUBLISHED = replace(OURS, perch=Weights(rate_between=0.0), hard_end=False, ramp=0.5, accuracy=(0.005, 1.0, 0.2))
+DEFAULT = Formulation()
+PUBLISHED = replace(DEFAULT, perch=Weights(rate_between=0.0), hard_end=False, ramp=0.5, accuracy=(0.005, 1.0, 0.2))
 """Formulation of the authors' code, for comparison with its trajectories."""

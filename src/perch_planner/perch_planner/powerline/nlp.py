@@ -12,10 +12,10 @@ import numpy as np
 from perch_core.rotor_model import INPUTS, STATES
 from perch_planner.powerline.derivatives import STRIDE, Parameters, constraint_rows, end_size, hessian, jacobian, path_functions, split
 from perch_planner.powerline.stage_functions import (
-    END_WEIGHTS, LINE_SIZE, REFERENCE, RUN_WEIGHTS, SEE_WEIGHTS, STAGE_STATES, StageFunctions,
+    END_WEIGHTS, LINE_SIZE, REFERENCE, RUN_WEIGHTS, PERCEPTION_WEIGHTS, STAGE_STATES, StageFunctions,
 )
 
-_FREE = np.inf
+_UNBOUNDED = np.inf
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Structure:
 
 
 @dataclass(frozen=True)
-class Numbers:
+class ProblemData:
     """Data of one problem of a structure: all values that change from solve to solve.
 
     Attributes:
@@ -47,12 +47,12 @@ class Numbers:
         lines: rows of centre, direction, radius, half length, shape (lines, 8).
         run_weights: thrust, body rate, ramp, body rate between nodes, shape (4,); see `stage_functions`.
         end_weights: horizontal position, height, tilt, velocity, body rate, thrust, shape (6,).
-        see_weights: reprojection, cheirality, segment visibility of every node, shape (N, 3).
+        perception_weights: reprojection, cheirality, segment visibility of every node, shape (N, 3).
         duration: bounds of T [s]. [P:eq14c]
         height_min: z_min with its margin [m]. [P:eq14e]
         thrust: bounds of a rotor's thrust [N]. [P:eq14f]
         body_rate: bound of |w_WB_B| [rad/s].
-        end_room: tolerances of the values that vanish at the last node, one each, see `solving.end_room`.
+        end_tolerance: tolerances of the values that vanish at the last node, one each, see `solving.end_tolerances`.
         clearance: least (d^2 - 1) / (d^2 + 1) of the scaled distance d to a line at each node but the first, see
             `stage_functions`, shape (N,). [P:eq14j]
         states, inputs: initial guess, shapes (N + 1, 18) and (N, 4), inputs in [-1, 1].
@@ -64,12 +64,12 @@ class Numbers:
     lines: np.ndarray
     run_weights: np.ndarray
     end_weights: np.ndarray
-    see_weights: np.ndarray
+    perception_weights: np.ndarray
     duration: tuple[float, float]
     height_min: float
     thrust: tuple[float, float]
     body_rate: float
-    end_room: np.ndarray
+    end_tolerance: np.ndarray
     clearance: np.ndarray
     states: np.ndarray
     inputs: np.ndarray
@@ -124,27 +124,27 @@ class Problem:
     def __post_init__(self) -> None:
         N, count, f = self.structure.intervals, self.structure.lines, self.stages.functions
         x = ca.MX.sym("x", N * STRIDE + STAGE_STATES)
-        sizes = [LINE_SIZE] * count + [1, STATES, REFERENCE, RUN_WEIGHTS, END_WEIGHTS, SEE_WEIGHTS * N, STAGE_STATES * N]
+        sizes = [LINE_SIZE] * count + [1, STATES, REFERENCE, RUN_WEIGHTS, END_WEIGHTS, PERCEPTION_WEIGHTS * N, STAGE_STATES * N]
         p = ca.MX.sym("p", sum(sizes))
-        *lines, body_rate, start, reference, run, end, see, defects = ca.vertsplit(p, np.cumsum([0, *sizes]).tolist())
-        parameters = Parameters(lines, body_rate, reference, run, end, ca.reshape(see, SEE_WEIGHTS, N))
+        *lines, body_rate, start, reference, run, end, perception, defects = ca.vertsplit(p, np.cumsum([0, *sizes]).tolist())
+        parameters = Parameters(lines, body_rate, reference, run, end, ca.reshape(perception, PERCEPTION_WEIGHTS, N))
         X, U = split(x, N)
 
         cost = ca.sum2(f["run"].map(N)(X[:, :N], U, 1.0 / N, run)) + f["end"](X[:, N], reference, end)
         if self.structure.perception:
-            cost += ca.sum2(f["see"].map(N)(X[:, :N], lines[0], parameters.see))
+            cost += ca.sum2(f["perception"].map(N)(X[:, :N], lines[0], parameters.perception))
         gaps = X[:, 1:] - f["step"].map(N)(X[:, :N], U, 1.0 / N) - ca.reshape(defects, STAGE_STATES, N)
         path = path_functions(parameters)
-        inside = ca.vertcat(*[f[name].map(N)(X[:, 1:], parameter) for name, parameter in path])
-        turn = f["turn"].map(N)(X[:, :N], U, 1.0 / N, body_rate)
-        later = ca.vec(ca.vertcat(gaps[:, 1:], inside[:, :-1], turn[1:]))
+        path_values = ca.vertcat(*[f[name].map(N)(X[:, 1:], parameter) for name, parameter in path])
+        between = f["body_rate_between"].map(N)(X[:, :N], U, 1.0 / N, body_rate)
+        remaining = ca.vec(ca.vertcat(gaps[:, 1:], path_values[:, :-1], between[1:]))
         end_name = self.structure.end
-        g = ca.vertcat(gaps[:, 0], X[:STATES, 0] - start, turn[0], later, inside[:, -1],
+        g = ca.vertcat(gaps[:, 0], X[:STATES, 0] - start, between[0], remaining, path_values[:, -1],
                        *([f[end_name](X[:, N], reference)] if end_name else []))
         at = constraint_rows(N, len(path), end_size(self.stages, end_name))
         self._clearances = (at.inner[:, None] + np.arange(count)).ravel()
         self._equality = np.ones(at.count, bool)
-        self._equality[self._clearances] = self._equality[at.inner + count] = self._equality[at.turn] = False
+        self._equality[self._clearances] = self._equality[at.inner + count] = self._equality[at.between] = False
         self._equality[at.end:] = False
         self._end = at.end
 
@@ -173,13 +173,13 @@ class Problem:
             return {}
         return {f"{name}.mu_init": self.barrier, f"{name}.bound_push": self.push, f"{name}.bound_frac": self.push}
 
-    def _bounds(self, numbers: Numbers) -> tuple[np.ndarray, np.ndarray]:
+    def _bounds(self, data: ProblemData) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the variables; T is bounded at the first node only, as it is equal at all nodes."""
         N = self.structure.intervals
-        low, high = np.full((N + 1, STRIDE), -_FREE), np.full((N + 1, STRIDE), _FREE)
-        low[1:, 2] = numbers.height_min
-        low[1:, 13:17], high[1:, 13:17] = numbers.thrust
-        low[0, STATES], high[0, STATES] = numbers.duration
+        low, high = np.full((N + 1, STRIDE), -_UNBOUNDED), np.full((N + 1, STRIDE), _UNBOUNDED)
+        low[1:, 2] = data.height_min
+        low[1:, 13:17], high[1:, 13:17] = data.thrust
+        low[0, STATES], high[0, STATES] = data.duration
         low[:, STAGE_STATES:], high[:, STAGE_STATES:] = -1.0, 1.0
         return low.ravel()[:-INPUTS], high.ravel()[:-INPUTS]
 
@@ -196,24 +196,24 @@ class Problem:
             fine = step(fine, inputs.T, 0.25 / N)
         return np.array(fine - coarse).T
 
-    def solve(self, numbers: Numbers) -> Solution:
+    def solve(self, data: ProblemData) -> Solution:
         """Solve one problem from its initial guess."""
         N = self.structure.intervals
-        guess = np.concatenate([numbers.states, np.vstack([numbers.inputs, np.zeros(INPUTS)])], axis=1).ravel()[:-INPUTS]
-        parameters = np.concatenate([numbers.lines.ravel(), [numbers.body_rate], numbers.start, numbers.reference, numbers.run_weights,
-                                     numbers.end_weights, numbers.see_weights.ravel(),
-                                     numbers.defects.ravel()])
-        low, high = self._bounds(numbers)
-        least = np.zeros(len(self._equality))
-        least[self._clearances] = np.repeat(numbers.clearance, self.structure.lines)
-        most = np.where(self._equality, 0.0, _FREE)
-        least[self._end:], most[self._end:] = -numbers.end_room, numbers.end_room
+        guess = np.concatenate([data.states, np.vstack([data.inputs, np.zeros(INPUTS)])], axis=1).ravel()[:-INPUTS]
+        parameters = np.concatenate([data.lines.ravel(), [data.body_rate], data.start, data.reference, data.run_weights,
+                                     data.end_weights, data.perception_weights.ravel(),
+                                     data.defects.ravel()])
+        low, high = self._bounds(data)
+        lower = np.zeros(len(self._equality))
+        lower[self._clearances] = np.repeat(data.clearance, self.structure.lines)
+        upper = np.where(self._equality, 0.0, _UNBOUNDED)
+        lower[self._end:], upper[self._end:] = -data.end_tolerance, data.end_tolerance
         begin, cpu = time.perf_counter(), time.process_time()
-        answer = self._solver(x0=guess, p=parameters, lbx=low, ubx=high,
-                              lbg=least, ubg=most)
+        result = self._solver(x0=guess, p=parameters, lbx=low, ubx=high,
+                              lbg=lower, ubg=upper)
         elapsed, cpu = time.perf_counter() - begin, time.process_time() - cpu
         statistics = self._solver.stats()
-        found = np.concatenate([np.array(answer["x"]).ravel(), np.zeros(INPUTS)]).reshape(N + 1, STRIDE)
+        found = np.concatenate([np.array(result["x"]).ravel(), np.zeros(INPUTS)]).reshape(N + 1, STRIDE)
         return Solution(found[:, :STAGE_STATES], found[:-1, STAGE_STATES:], bool(statistics["success"]),
                         str(statistics.get("return_status", statistics.get("unified_return_status", ""))),
-                        float(answer["f"]), int(statistics["iter_count"]), elapsed, cpu)
+                        float(result["f"]), int(statistics["iter_count"]), elapsed, cpu)

@@ -10,7 +10,7 @@ import numpy as np
 from perch_core.errors import PlanningRefusal
 from perch_core.rotor_model import P, Q, THRUST
 from perch_core.vehicle import GRAVITY, Vehicle
-from perch_planner.powerline.formulation import OURS, Formulation
+from perch_planner.powerline.formulation import DEFAULT, Formulation
 from perch_planner.powerline.nlp import Structure
 from perch_planner.powerline.plan import PowerlinePlan
 from perch_planner.powerline.relaxation import fly_perch
@@ -28,7 +28,7 @@ class PowerlinePlanner:
     vehicle: Vehicle
     settings: PowerlineSettings = field(default_factory=PowerlineSettings)
     gravity: float = GRAVITY
-    formulation: Formulation = OURS
+    formulation: Formulation = DEFAULT
     solver: Solver = field(init=False)
 
     def __post_init__(self) -> None:

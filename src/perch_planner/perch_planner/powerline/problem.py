@@ -15,7 +15,7 @@ from perch_core.errors import ConfigError
 from perch_core.lines import Segment
 from perch_core.rotor_model import RotorModel, V, W, hover_state
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
-from perch_planner.powerline.formulation import OURS, PUBLISHED
+from perch_planner.powerline.formulation import DEFAULT, PUBLISHED
 from perch_planner.powerline.plan import PowerlinePlan
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
@@ -150,7 +150,7 @@ def plan(problem: PowerlineProblem, **changes: Any) -> PlannedProblem:
         PlanningRefusal: bad request, or no trajectory within the limits.
     """
     vehicle = load_vehicle(problem.vehicle)
-    planner = PowerlinePlanner(vehicle, problem.settings, problem.gravity, PUBLISHED if problem.published else OURS)
+    planner = PowerlinePlanner(vehicle, problem.settings, problem.gravity, PUBLISHED if problem.published else DEFAULT)
     request = problem.request(vehicle)
     for name, value in changes.items():
         request = config.replace(request, **{name: value})

@@ -42,8 +42,8 @@ def check_request(request: PowerlinePlanRequest) -> None:
     if len(request.rotor_thrust) not in (0, 4):
         raise ConfigError("request", "rotor_thrust", f"has {len(request.rotor_thrust)} values, needs 4 or none")
     for (name, limit), value in zip(limits.POSE.items(), request.perch_pose or ()):
-        if said := limit.problem(value):
-            raise ConfigError("request", f"perch_pose.{name}", said)
+        if problem := limit.problem(value):
+            raise ConfigError("request", f"perch_pose.{name}", problem)
 
 
 def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offset: float) -> PowerlineRequest:
@@ -62,24 +62,24 @@ def planner_request(request: PowerlinePlanRequest, model: RotorModel, wire_offse
     if len(request.rotor_thrust):
         start[THRUST] = request.rotor_thrust
     lines = tuple(line.segment for line in request.lines)
-    wanted = PowerlineRequest(start, lines, int(request.target_line), None, bool(request.perception_aware), bool(request.with_recovery),
+    converted = PowerlineRequest(start, lines, int(request.target_line), None, bool(request.perception_aware), bool(request.with_recovery),
                               bool(request.recovery_only))
     if request.recovery_only:
-        return wanted
-    target = wanted.target()
+        return converted
+    target = converted.target()
     if request.perch_pose is not None:
         perch = PerchPose.at(*request.perch_pose, request.end_velocity)
     else:
         point = np.asarray(request.perch_point, float)
-        away = float(target.distance(point))
-        if away > POINT_REACH:
-            raise PlanningRefusal("bad_input", "perch point", POINT_REACH - away,
-                                  f"perch_point {point.tolist()} is {away:.2f} m from line {target.id} between its ends (allowed {POINT_REACH:g} m)")
+        distance = float(target.distance(point))
+        if distance > POINT_REACH:
+            raise PlanningRefusal("bad_input", "perch point", POINT_REACH - distance,
+                                  f"perch_point {point.tolist()} is {distance:.2f} m from line {target.id} between its ends (allowed {POINT_REACH:g} m)")
         perch = PerchPose.on_line(target, point, float(request.perch_pitch), wire_offset, start[P], request.end_velocity)
-    return replace(wanted, perch=perch)
+    return replace(converted, perch=perch)
 
 
-def answer(found: plan.PowerlinePlan, model: RotorModel, start: int) -> PowerlinePlan:
+def plan_response(found: plan.PowerlinePlan, model: RotorModel, start: int) -> PowerlinePlan:
     """Return the response with a plan.
 
     Args:
@@ -103,7 +103,7 @@ def answer(found: plan.PowerlinePlan, model: RotorModel, start: int) -> Powerlin
         iterations=int(sum(part.iterations for part in found.parts)), solver=found.parts[0].solver)
 
 
-def refused(error: Exception) -> PowerlinePlan:
+def refusal_response(error: Exception) -> PowerlinePlan:
     """Return the response without a plan.
 
     Args:

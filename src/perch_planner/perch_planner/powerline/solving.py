@@ -18,24 +18,24 @@ from perch_core.rotor_model import RotorModel
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline import compiled
 from perch_planner.powerline.formulation import Weights
-from perch_planner.powerline.nlp import Numbers, Problem, Solution, Structure
+from perch_planner.powerline.nlp import ProblemData, Problem, Solution, Structure
 from perch_planner.powerline.settings import PerceptionWeights
 from perch_planner.powerline.stage_functions import StageFunctions, StageModel, stage_functions
 
 # Tolerance, first barrier parameter, push off active bounds: of a solve, of the approach to it with perception costs, and of
-# one that starts from the solution of the same problem, which is right but for the integrator's error. A trial only looks for
-# a limit that stands in the way: a plan without that one is found soon, in 20 iterations or so.
+# one that starts from the solution of the same problem, which is right but for the integrator's error. A trial only searches for
+# the limit that prevents a plan: a plan without that one is found soon, in 20 iterations or so.
 PHASES: dict[str, dict[str, Any]] = {
-    "sight": {"tolerance": 0.3, "max_iterations": 24, "gauss_newton": True},
+    "gauss_newton": {"tolerance": 0.3, "max_iterations": 24, "gauss_newton": True},
     "solve": {"tolerance": 1e-3, "barrier": 1e-2, "max_iterations": 100},
     "trial": {"tolerance": 1e-3, "barrier": 1e-2, "max_iterations": 50},
-    "polish": {"tolerance": 1e-4, "barrier": 1e-4, "push": 1e-4},
+    "refine": {"tolerance": 1e-4, "barrier": 1e-4, "push": 1e-4},
 }
-IPOPT_ITERATIONS = 300  # the last resort may take as many
-END_SHARE = 0.2     # of the accuracy that is asked for at the end: the room that the program has there
-MOMENT_ROOM = 0.01  # of the moment at the end of a perch [N m]
-RATE_ROOM = 0.02    # of the body rate at the end [rad/s]
-THRUST_ROOM = 0.02  # of a rotor's thrust where a hover follows [N]
+IPOPT_ITERATIONS = 300  # of IPOPT, which is tried last
+END_SHARE = 0.2          # of the required accuracy at the end: the tolerance of the program there
+MOMENT_TOLERANCE = 0.01  # of the moment at the end of a perch [N m]
+RATE_TOLERANCE = 0.02    # of the body rate at the end [rad/s]
+THRUST_TOLERANCE = 0.02  # of a rotor's thrust where a hover follows [N]
 
 REPROJECTION_DECAY = 0.1  # of the cost [P:eq9], per thirtieth of the horizon
 SOFT_DECAY = 0.3          # of the soft constraints [P:eq14h, P:eq14i], the same, from SOFT_UNTIL on
@@ -73,40 +73,40 @@ class Solver:
             self._problems[key] = Problem(structure, self._stages, **options)
         return self._problems[key]
 
-    def solve(self, structure: Structure, numbers: Numbers, start_phase: str = "sight") -> Solution:
+    def solve(self, structure: Structure, data: ProblemData, start_phase: str = "gauss_newton") -> Solution:
         """Run all phases that a guess of this quality needs.
 
         Args:
             structure: selects the solver.
-            numbers: the problem without defects.
-            start_phase: "sight" for a cold guess, "trial" for a cold guess with fewer iterations, "solve" for the solution of a
-                similar problem, "polish" for a guess that is right up to the integrator's error.
+            data: the problem without defects.
+            start_phase: "gauss_newton" for a cold guess, "trial" for a cold guess with fewer iterations, "solve" for the solution of a
+                similar problem, "refine" for a guess that is right up to the integrator's error.
 
         Returns:
             The solution of the last phase, with iterations and times of all; that of the first phase where it diverges.
         """
         iterations, time, cpu_time = 0, 0.0, 0.0
-        cold = start_phase in ("sight", "trial")
-        sight = cold and structure.perception
-        if sight:
-            first = self.problem(structure, "sight").solve(numbers)
+        cold = start_phase in ("gauss_newton", "trial")
+        gauss_newton = cold and structure.perception
+        if gauss_newton:
+            first = self.problem(structure, "gauss_newton").solve(data)
             iterations, time, cpu_time = first.iterations, first.time, first.cpu_time
             if not np.all(np.isfinite(first.states)):
                 return first
-            numbers = replace(numbers, states=first.states, inputs=first.inputs)
-        last = self.problem(structure, "solve" if start_phase == "sight" else start_phase)
-        if sight or not cold:
-            numbers = replace(numbers, defects=last.defects_of(numbers.states, numbers.inputs))
-        found = last.solve(numbers)
+            data = replace(data, states=first.states, inputs=first.inputs)
+        last = self.problem(structure, "solve" if start_phase == "gauss_newton" else start_phase)
+        if gauss_newton or not cold:
+            data = replace(data, defects=last.defects_of(data.states, data.inputs))
+        found = last.solve(data)
         return replace(found, iterations=iterations + found.iterations, time=time + found.time,
                        cpu_time=cpu_time + found.cpu_time)
 
 
-def end_room(end: str, position: float, tilt_deg: float, speed: float) -> np.ndarray:
+def end_tolerances(end: str, position: float, tilt_deg: float, speed: float) -> np.ndarray:
     """Tolerances of the values of the stage function `perched`, `hovering` or none ("") that an accuracy permits."""
     turned, moving = [np.radians(tilt_deg)] * 2, [speed] * 3
     shares: list[float] = {"perched": [position] * 3 + turned + moving, "hovering": turned + moving, "": []}[end]
-    rest = {"perched": [RATE_ROOM] * 3 + [MOMENT_ROOM] * 3, "hovering": [RATE_ROOM] * 3 + [THRUST_ROOM] * 4, "": []}[end]
+    rest = {"perched": [RATE_TOLERANCE] * 3 + [MOMENT_TOLERANCE] * 3, "hovering": [RATE_TOLERANCE] * 3 + [THRUST_TOLERANCE] * 4, "": []}[end]
     return np.array([*(END_SHARE * np.array(shares)), *rest])
 
 
@@ -125,7 +125,7 @@ def end_weights(weights: Weights) -> np.ndarray:
     return np.array([weights.xy_end, weights.z_end, weights.tilt_end, weights.v_end, weights.w_end, weights.thrust_end])
 
 
-def see_weights(weights: PerceptionWeights, intervals: int) -> np.ndarray:
+def perception_weights(weights: PerceptionWeights, intervals: int) -> np.ndarray:
     """Perception weights of every node with their exponential decay, shape (N, 3). [P:V-A]
 
     The line is out of view at the end of the perch, so neither the cost nor the constraints may dominate there.

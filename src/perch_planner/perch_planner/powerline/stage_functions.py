@@ -21,11 +21,11 @@ from perch_core.components import Scalar, Vector, components, dot, matrix_of, ro
 from perch_core.rotor_model import INPUTS, P, Q, STATES, THRUST, V, W, RotorModel
 from perch_core.so3 import quat_from_matrix
 
-STAGE_STATES = STATES + 1  # the duration T rides along as a constant state
+STAGE_STATES = STATES + 1  # the duration T is a constant state
 SUB_STEPS = 2  # one RK4 step per T/30 drifts up to 22 mm when re-integrated; two stay below 0.7 mm
 LINE_SIZE = 8  # centre (3), direction (3), radius, half length
-SEGMENT_AIM = 0.5  # share of the segment's half length within which the soft constraint wants the centred point
-RUN_WEIGHTS, SEE_WEIGHTS, END_WEIGHTS, REFERENCE = 4, 3, 6, 12
+SEGMENT_AIM = 0.5  # share of the segment's half length within which the soft constraint keeps the centred point
+RUN_WEIGHTS, PERCEPTION_WEIGHTS, END_WEIGHTS, REFERENCE = 4, 3, 6, 12
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,12 @@ def _run(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, weights: Ve
     return weights[0] * dot(impulse, impulse) + weights[1] * dot(x[W], x[W]) + weights[3] * dot(half, half)
 
 
-def _violated(h: Scalar) -> Scalar:
+def _violation(h: Scalar) -> Scalar:
     """Violation of a soft constraint h > 0; its square equals the cost of a slack with quadratic cost."""
     return ca.fmax(0, -h)
 
 
-def _sight(model: StageModel, x: Vector, line: Vector) -> Vector:
+def _perception_residuals(model: StageModel, x: Vector, line: Vector) -> Vector:
     """Residuals of the perception cost: reprojection, cheirality, segment visibility. [uses P:eq9, P:eq12, P:eq13]
 
     The authors' arctan of [P:eq13] has zero slope where the camera axis is parallel to the line, so that a solver started
@@ -96,12 +96,12 @@ def _sight(model: StageModel, x: Vector, line: Vector) -> Vector:
     n_I, l_I = lines.image_line(o_C, l_C)
     along, in_front = lines.segment_place(n_I, l_I, o_C, line[7])
     beside = ca.fabs(ca.atan2(along, SEGMENT_AIM * in_front)) - np.pi / 4
-    return lines.reprojection_error(n_I), _violated(in_front), _violated(-beside)
+    return lines.reprojection_error(n_I), _violation(in_front), _violation(-beside)
 
 
-def _see(model: StageModel, x: Vector, line: Vector, weights: Vector) -> Scalar:
+def _perception(model: StageModel, x: Vector, line: Vector, weights: Vector) -> Scalar:
     """Perception cost and soft constraints of the target line. [P:eq9, P:eq12, P:eq13, P:eq14h, P:eq14i]"""
-    return sum(weight * value * value for weight, value in zip(weights, _sight(model, x, line), strict=True))
+    return sum(weight * value * value for weight, value in zip(weights, _perception_residuals(model, x, line), strict=True))
 
 
 def _end(model: StageModel, x: Vector, reference: Vector, weights: Vector) -> Scalar:
@@ -116,39 +116,39 @@ def _end(model: StageModel, x: Vector, reference: Vector, weights: Vector) -> Sc
         reference: p (3), s3 (3), v (3), w (3).
         weights: horizontal position, height, tilt, velocity, body rate, rotor thrust.
     """
-    def off(values: Vector, first: int) -> Scalar:
+    def squared_error(values: Vector, first: int) -> Scalar:
         error = tuple(value - reference[first + i] for i, value in enumerate(values))
         return dot(error, error)
 
     b3_W = tuple(row[2] for row in matrix_of(x[Q]))
-    idle = tuple(gamma - model.rotor.hover for gamma in x[THRUST])
+    hover_error = tuple(gamma - model.rotor.hover for gamma in x[THRUST])
     height = x[2] - reference[2]
-    return (weights[0] * off(x[0:2], 0) + weights[1] * height * height + weights[2] * off(b3_W, 3)
-            + weights[3] * off(x[V], 6) + weights[4] * off(x[W], 9) + weights[5] * dot(idle, idle))
+    return (weights[0] * squared_error(x[0:2], 0) + weights[1] * height * height + weights[2] * squared_error(b3_W, 3)
+            + weights[3] * squared_error(x[V], 6) + weights[4] * squared_error(x[W], 9) + weights[5] * dot(hover_error, hover_error))
 
 
-def _turned(x: Vector, reference: Vector) -> Vector:
+def _tilt_error(x: Vector, reference: Vector) -> Vector:
     """First two components of s3 in the body frame, which vanish where b3 is s3 (or -s3)."""
     return rotate_back(x[Q], reference[3:6])[:2]
 
 
 def _perched(model: StageModel, x: Vector, reference: Vector) -> Vector:
-    """Values that vanish at the end of a perch: the errors of `_ended`, and the moment, for a gripper to close; 14 values."""
-    return (*_ended(x, reference), *(dot(row, x[THRUST]) for row in model.rotor.torque))
+    """Values that vanish at the end of a perch: the errors of `_end_errors`, and the moment, for a gripper to close; 14 values."""
+    return (*_end_errors(x, reference), *(dot(row, x[THRUST]) for row in model.rotor.torque))
 
 
-def _ended(x: Vector, reference: Vector) -> Vector:
+def _end_errors(x: Vector, reference: Vector) -> Vector:
     """Errors of position, direction of b3, velocity and body rate at the end, 11 values."""
-    moving = tuple(value - wanted for value, wanted in zip((*x[V], *x[W]), reference[6:12], strict=True))
-    return (*(value - wanted for value, wanted in zip(x[P], reference[:3], strict=True)), *_turned(x, reference), *moving)
+    moving = tuple(value - goal for value, goal in zip((*x[V], *x[W]), reference[6:12], strict=True))
+    return (*(value - goal for value, goal in zip(x[P], reference[:3], strict=True)), *_tilt_error(x, reference), *moving)
 
 
 def _hovering(model: StageModel, x: Vector, reference: Vector) -> Vector:
-    """Values that vanish at the end of a recovery, at any position: as `_ended`, rotor thrusts for the position; 12 values."""
-    return (*_ended(x, reference)[3:], *(gamma - model.rotor.hover for gamma in x[THRUST]))
+    """Values that vanish at the end of a recovery, at any position: as `_end_errors`, rotor thrusts for the position; 12 values."""
+    return (*_end_errors(x, reference)[3:], *(gamma - model.rotor.hover for gamma in x[THRUST]))
 
 
-def _clear(model: StageModel, x: Vector, line: Vector) -> Scalar:
+def _clearance(model: StageModel, x: Vector, line: Vector) -> Scalar:
     """[P:eq7] divided by |o x l|^2 + |l|^2 + k: (d^2 - 1) / (d^2 + 1) of the scaled distance d.
 
     The sign is the paper's, but the value is dimensionless, between -1 and 1, and its slope at contact is 1, so that
@@ -160,18 +160,18 @@ def _clear(model: StageModel, x: Vector, line: Vector) -> Scalar:
     return h / (h + 2 * dot(l, l))
 
 
-def _spin(x: Vector, limit: Scalar) -> Scalar:
+def _body_rate(x: Vector, limit: Scalar) -> Scalar:
     """1 - |w|^2 / limit^2: positive where the body rate is below its limit, about any axis."""
     return 1 - dot(x[W], x[W]) / (limit * limit)
 
 
-def _turn(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, limit: Scalar) -> Scalar:
-    """`_spin` in the middle of the interval that starts at a node.
+def _body_rate_between(model: StageModel, x: Vector, u: Vector, unit_step: Scalar, limit: Scalar) -> Scalar:
+    """`_body_rate` in the middle of the interval that starts at a node.
 
     A light body may reach its greatest rate between two nodes and be at rest at both: its torque permits 5000 rad/s^3.
     Body rate and thrusts do not depend on the rest of the state, so that this costs little.
     """
-    return _spin(_halfway(model, x, u, unit_step), limit)
+    return _body_rate(_halfway(model, x, u, unit_step), limit)
 
 
 @dataclass(frozen=True)
@@ -179,13 +179,13 @@ class StageFunctions:
     """The functions of one stage, their derivatives as flat vectors of nonzeros, and the sparsity of these.
 
     Attributes:
-        functions: by name. `step(x, u, 1/N) -> x_next`; `run(x, u, 1/N, weights)`, `see(x, line, weights)`,
-            `end(x, reference, weights)` -> cost; `clear(x, line)`, `spin(x, limit)`, `turn(x, u, 1/N, limit)` -> constraint,
-            `perched(x, reference)`, `hovering(x, reference)` -> values that vanish at the end,
+        functions: by name. `step(x, u, 1/N) -> x_next`; `run(x, u, 1/N, weights)`, `perception(x, line, weights)`,
+            `end(x, reference, weights)` -> cost; `clearance(x, line)`, `body_rate(x, limit)`, `body_rate_between(x, u, 1/N, limit)`
+            -> constraint; `perched(x, reference)`, `hovering(x, reference)` -> values that vanish at the end,
             with x of 18 values (17 states, T) and u of 4 in [-1, 1]. `<name>_jac(...)` -> nonzeros of the
             Jacobian; `<name>_hess(..., lam)` -> gradient of lam . f and then the nonzeros
             of the upper triangle of its Hessian. Derivatives are with respect to x, or (x, u).
-            `see_gauss_newton` is `see_hess` without the curvature of the residuals: positive semidefinite.
+            `perception_gauss_newton` is `perception_hess` without the curvature of the residuals: positive semidefinite.
         jacobian, hessian: sparsity of these nonzeros by base name; the Hessian's is an upper triangle.
     """
 
@@ -199,24 +199,24 @@ class StageFunctions:
 
 
 def stage_functions(model: StageModel) -> StageFunctions:
-    """Build the stage functions and their derivatives as expressions; `run`, `see` and `end` are the cost. [defines P:eq15]"""
+    """Build the stage functions and their derivatives as expressions; `run`, `perception` and `end` are the cost. [defines P:eq15]"""
     x, u = ca.SX.sym("x", STAGE_STATES), ca.SX.sym("u", INPUTS)
     line, reference = ca.SX.sym("line", LINE_SIZE), ca.SX.sym("reference", REFERENCE)
     unit_step, limit = ca.SX.sym("unit_step"), ca.SX.sym("limit")
-    run, see, end = (ca.SX.sym(name, size) for name, size in
-                     (("run", RUN_WEIGHTS), ("see", SEE_WEIGHTS), ("end", END_WEIGHTS)))
+    run, perception, end = (ca.SX.sym(name, size) for name, size in
+                     (("run", RUN_WEIGHTS), ("perception", PERCEPTION_WEIGHTS), ("end", END_WEIGHTS)))
     xs, us, ls, rs = map(components, (x, u, line, reference))
-    rw, sw, ew = map(components, (run, see, end))
+    rw, pw, ew = map(components, (run, perception, end))
     expressions = {
         "step": ([x, u], [unit_step], ca.vertcat(*_step(model, xs, us, unit_step))),
         "run": ([x, u], [unit_step, run], _run(model, xs, us, unit_step, rw)),
-        "see": ([x], [line, see], _see(model, xs, ls, sw)),
+        "perception": ([x], [line, perception], _perception(model, xs, ls, pw)),
         "end": ([x], [reference, end], _end(model, xs, rs, ew)),
         "perched": ([x], [reference], ca.vertcat(*_perched(model, xs, rs))),
         "hovering": ([x], [reference], ca.vertcat(*_hovering(model, xs, rs))),
-        "clear": ([x], [line], _clear(model, xs, ls)),
-        "spin": ([x], [limit], _spin(xs, limit)),
-        "turn": ([x, u], [unit_step, limit], _turn(model, xs, us, unit_step, limit)),
+        "clearance": ([x], [line], _clearance(model, xs, ls)),
+        "body_rate": ([x], [limit], _body_rate(xs, limit)),
+        "body_rate_between": ([x, u], [unit_step, limit], _body_rate_between(model, xs, us, unit_step, limit)),
     }
     functions, jacobian, hessian = {}, {}, {}
     for name, (variables, parameters, value) in expressions.items():
@@ -232,11 +232,11 @@ def stage_functions(model: StageModel) -> StageFunctions:
         functions[f"{name}_hess"] = ca.Function(f"{name}_hess", [*inputs, lam],
                                                 ca.cse([ca.vertcat(ca.densify(gradient), _nonzeros(H))]))
         jacobian[name], hessian[name] = J.sparsity(), H.sparsity()
-    lam, residuals = ca.SX.sym("lam"), ca.vertcat(*_sight(model, xs, ls))
+    lam, residuals = ca.SX.sym("lam"), ca.vertcat(*_perception_residuals(model, xs, ls))
     J = ca.jacobian(residuals, x)
-    gradient, H = (2 * lam * J.T @ (ca.diag(see) @ right) for right in (residuals, J))
-    functions["see_gauss_newton"] = ca.Function("see_gauss_newton", [x, line, see, lam], [
-        ca.cse(ca.vertcat(ca.densify(gradient), _nonzeros(ca.project(ca.triu(H), hessian["see"]))))])
+    gradient, H = (2 * lam * J.T @ (ca.diag(perception) @ right) for right in (residuals, J))
+    functions["perception_gauss_newton"] = ca.Function("perception_gauss_newton", [x, line, perception, lam], [
+        ca.cse(ca.vertcat(ca.densify(gradient), _nonzeros(ca.project(ca.triu(H), hessian["perception"]))))])
     return StageFunctions(functions, jacobian, hessian)
 
 

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
-from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Wake, ports, run_now
+from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Timer, ports, run_now
 from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS
 from perch_sim.lockstep.packet import Codec, Packet
@@ -150,7 +150,7 @@ class LocalParticipant(Participant):
         self.inputs = frozenset(self._handlers)
         self._emissions = Emissions(component, codec)
         self._ask = ask or local_servers(())
-        self._wakes: list[list[Any]] = [[0, round(port.period * NANOSECONDS), port.handler(component)] for port in ports(kind, Wake)]
+        self._wakes: list[list[Any]] = [[0, round(port.period * NANOSECONDS), port.handler(component)] for port in ports(kind, Timer)]
         self._outside: deque[Callable[[], None]] = deque()  # requests and goals, in front of the next batch
         self._awaited: list[_Awaited] = []
         self._now, self._begun = 0, False

@@ -17,7 +17,7 @@ from typing import Any
 from perch_core.component import Action, Client, Component, Input, Service, Unavailable, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
-from perch_core.ros.asking import connect_clients
+from perch_core.ros.service_clients import connect_clients
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import Intake
 from perch_core.ros.priority import priority
@@ -73,10 +73,10 @@ class ParticipantNode(ComponentNode):
             self._intake.add(observed)
         if self._asking:
             self.create_timer(1.0, self._give_up, clock=self._steady)
-        if self.wiring.schedule_here:
+        if self.wiring.hosts_schedule:
             return
         if is_slow(self.get_name()):
-            priority.give_way()  # a step goes before work that has time
+            priority.lower_priority()  # a step goes before work that has time
         self._where = address(os.environ.get("ROS_DOMAIN_ID", "0"), self.get_namespace())
         self._look = self.create_timer(LOOK, self._go_on, clock=self._steady)
         self._look.cancel()
@@ -136,7 +136,7 @@ class ParticipantNode(ComponentNode):
             try:
                 return results()
             except Exception as error:
-                self.refused("step", error)
+                self.log_refusal("step", error)
 
     def _leave(self) -> None:
         """The vehicle has gone; another one may come."""
@@ -146,7 +146,7 @@ class ParticipantNode(ComponentNode):
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
-    def bring(self, port: Service | Action, work: Callable[..., None], *arguments: Any) -> None:
+    def dispatch(self, port: Service | Action, work: Callable[..., None], *arguments: Any) -> None:
         """In front of the next batch, which may have waited for it."""
         self.participant.enter(port.name, partial(self.guarded, port.name, work, *arguments))
         self._progress()
@@ -177,7 +177,7 @@ class ParticipantNode(ComponentNode):
 
     def _progress(self) -> None:
         """What the present batch waits for may have come."""
-        if self.wiring.schedule_here:
+        if self.wiring.hosts_schedule:
             self.wiring.progress()
         else:
             self._go_on()

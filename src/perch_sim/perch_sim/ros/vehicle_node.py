@@ -10,8 +10,8 @@ from typing import Any
 from perch_core.component import Component
 from perch_core.ros import topics
 from perch_core.ros.component_node import ComponentNode
-from perch_core.ros.intake import SHARED
-from perch_core.ros.wiring import Publication, Wiring, foreign_writers
+from perch_core.ros.intake import SHARED_TOPICS
+from perch_core.ros.wiring import Publication, Wiring, foreign_publishers
 from perch_core.values import CameraImage
 from perch_sim.lockstep import BEGUN, Schedule, flight_tasks
 from perch_sim.lockstep.link import Door, Waiting, address
@@ -58,7 +58,7 @@ class VehicleNode(ComponentNode):
         self._allowance = 0
         self._counted = (time.monotonic(), 0)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        wiring.schedule_here, wiring.progress = True, self._advance
+        wiring.hosts_schedule, wiring.progress = True, self._advance
 
     def connect(self) -> None:
         """Take in who shares the process, and wait for the others."""
@@ -69,13 +69,13 @@ class VehicleNode(ComponentNode):
         self.create_timer(STRANGERS, self._look_for_strangers, clock=self._steady)
         self.create_timer(1.0, self._diagnose, clock=self._steady)
 
-    def _emitted(self, topic: str, publication: Publication):
+    def _emit_function(self, topic: str, publication: Publication):
         """Images go to neighbours and out when they have been drawn."""
-        usual = super()._emitted(topic, publication)
+        usual = super()._emit_function(topic, publication)
 
         def publish(value: Any) -> None:
             if isinstance(value, CameraImage) and value.ready is not None:
-                if self.wiring.read_here(topic) or publication.heard():
+                if self.wiring.has_reader(topic) or publication.has_subscribers():
                     self._undrawn.append((usual, value))
             else:
                 usual(value)
@@ -239,10 +239,10 @@ class VehicleNode(ComponentNode):
     def _look_for_strangers(self) -> None:
         """Name who publishes on topics of the flight without taking part: in lockstep that has no influence."""
         inputs = set().union(*(one.inputs for one in (*self._remote.values(), *self.wiring.participants.values())))
-        inputs = (inputs - set(SHARED)) | {"motor_command"}
+        inputs = (inputs - set(SHARED_TOPICS)) | {"motor_command"}
         known = {f"{self.get_namespace().rstrip('/')}/{name}" for name in (*self._expected, self.get_name())}
         for channel in sorted(inputs):
-            for stranger in foreign_writers(self, self.resolve_topic_name(channel), known):
+            for stranger in foreign_publishers(self, self.resolve_topic_name(channel), known):
                 self.warn_once(f"{channel}: {stranger} publishes it but takes no part in the lockstep: it is ignored")
 
     def close(self) -> None:
@@ -252,7 +252,7 @@ class VehicleNode(ComponentNode):
 
     # -- people ------------------------------------------------------------------------------------------------------
 
-    def host_figures(self) -> dict[str, Any]:
+    def host_diagnostics(self) -> dict[str, Any]:
         """How fast simulation time passes, and who is waited for."""
         now, steps = time.monotonic(), self._schedule.index
         since, before = self._counted

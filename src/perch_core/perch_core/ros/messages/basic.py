@@ -35,7 +35,7 @@ def require_measured(gyro: float, accelerometer: float) -> None:
     """
     if gyro < 0.0 or accelerometer < 0.0:
         missing = "angular velocity" if gyro < 0.0 else "acceleration"
-        raise PerchError(f"imu: its covariance says (-1) that there is no {missing}: both must be in one message")
+        raise PerchError(f"imu: no {missing} (covariance -1): both must be in one message")
 
 
 def require_body(child_frame: str) -> None:

@@ -15,7 +15,7 @@ from perch_msgs.msg import RatesThrust as RatesMessage
 from sensor_msgs.msg import Imu
 
 _IMU, _ODOMETRY, _MOTOR, _RATES, _ATTITUDE = map(Layout, (Imu, Odometry, MotorMessage, RatesMessage, AttitudeMessage))
-_NO_ORIENTATION = np.r_[0.0, 0.0, 0.0, 1.0, -1.0, np.zeros(8)].tobytes()  # attitude and its covariance, which says that there is none
+_NO_ORIENTATION = np.r_[0.0, 0.0, 0.0, 1.0, -1.0, np.zeros(8)].tobytes()  # attitude and its covariance, -1: there is none
 _NO_COVARIANCE = np.zeros(9).tobytes()
 _1, _3, _4, _6, _7, _8 = (Struct(f"<{n}d") for n in (1, 3, 4, 6, 7, 8))
 

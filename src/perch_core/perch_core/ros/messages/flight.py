@@ -7,8 +7,8 @@ from perch_core.errors import PerchError
 from perch_core.ros.messages.basic import floats, header, quaternion_floats, stamp_value, to_pose, to_quaternion, to_vector
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
-    Ask, AtEnd, AttitudeThrust, ChooseLaw, ControllerCommand, ControllerStatus, ControlReference, Done, LawChosen, MotorCommand, RatesThrust,
-    TrajectoryOrder, nanoseconds, seconds)
+    AtEnd, AttitudeThrust, ControllerCommand, ControllerStatus, ControlReference, MotorCommand, RatesThrust, SetControllerRequest,
+    SetControllerResponse, TrajectoryOrder, TriggerRequest, TriggerResponse, nanoseconds, seconds)
 from perch_msgs.msg import AttitudeThrust as AttitudeMessage
 from perch_msgs.msg import ControllerCommand as CommandMessage
 from perch_msgs.msg import ControllerStatus as StatusMessage
@@ -176,21 +176,21 @@ def reference_value(msg: ReferenceMessage) -> ControlReference:
 # -- services ----------------------------------------------------------------------------------------------------------
 
 
-def choose_law_value(msg: SetController.Request) -> ChooseLaw:
+def set_controller_request_value(msg: SetController.Request) -> SetControllerRequest:
     """Convert a request of `set_controller`."""
-    return ChooseLaw(msg.type, msg.adaptive)
+    return SetControllerRequest(msg.type, msg.adaptive)
 
 
-def law_chosen_message(answer: LawChosen) -> SetController.Response:
+def set_controller_response_message(answer: SetControllerResponse) -> SetController.Response:
     """Convert an answer of `set_controller` to its message."""
     return SetController.Response(success=bool(answer.success), error_code=int(answer.error_code), message=answer.message)
 
 
-def ask_value(_: Trigger.Request) -> Ask:
+def trigger_request_value(_: Trigger.Request) -> TriggerRequest:
     """Convert a request of a std_srvs/Trigger."""
-    return Ask()
+    return TriggerRequest()
 
 
-def done_message(answer: Done) -> Trigger.Response:
+def trigger_response_message(answer: TriggerResponse) -> Trigger.Response:
     """Convert an answer of a std_srvs/Trigger to its message."""
     return Trigger.Response(success=bool(answer.success), message=answer.message)

@@ -33,9 +33,9 @@ def feedback_message(feedback: PerchFeedback) -> Perch.Feedback:
                           message=feedback.message)
 
 
-def rejected(why: str) -> PerchResult:
+def rejected(reason: str) -> PerchResult:
     """Return the result of a rejected goal, with the reason as its message."""
-    return PerchResult(False, Perch.Result.BAD_GOAL, why)
+    return PerchResult(False, Perch.Result.BAD_GOAL, reason)
 
 
 def result_message(result: PerchResult) -> Perch.Result:

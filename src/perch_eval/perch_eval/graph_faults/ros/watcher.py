@@ -1,4 +1,4 @@
-"""What the campaign sees of a flight: the truth, the rotors, contacts, and what the controller says."""
+"""Observation of a flight: the truth, the rotors, contacts, and the controller's status."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHANNELS = ("ground_truth/odometry", "rotor_state", "contact", "controller/statu
 
 
 class Watcher:
-    """Subscribes with a pilot's node; only the newest message of each channel is looked at, and only when it is asked for.
+    """Subscribes with a pilot's node; only the newest message of each channel is decoded, and only on demand.
 
     Attributes:
         contacts: all of them, in order.
@@ -34,10 +34,10 @@ class Watcher:
         node = pilot.node
         for channel in CHANNELS:
             row = topics.topic(channel)
-            node.create_subscription(row.message, channel, partial(self._take, channel), row.qos.subscribe, raw=True)
+            node.create_subscription(row.message, channel, partial(self._on_message, channel), row.qos.subscribe, raw=True)
         self._fault = node.create_publisher(String, "relay/fault", topics.topic("trajectory").qos.publish)
 
-    def _take(self, channel: str, message: bytes) -> None:
+    def _on_message(self, channel: str, message: bytes) -> None:
         self._newest[channel] = message
         if channel == "contact":
             self.contacts.append(topics.decode(channel, message))
@@ -45,7 +45,7 @@ class Watcher:
             self._start = topics.decode(channel, message).p_WB
 
     def disturb(self, fault: str) -> None:
-        """Have the relay do something to what it passes on."""
+        """Set the fault of the relay."""
         self._fault.publish(String(data=fault))
 
     def _value(self, channel: str) -> Any:
@@ -54,7 +54,7 @@ class Watcher:
 
     @property
     def position(self) -> tuple[float, ...] | None:
-        """True position of the centre of mass in W [m]; None: nothing has come yet."""
+        """True position of the centre of mass in W [m]; None: nothing received yet."""
         state = self._value("ground_truth/odometry")
         return None if state is None else state.p_WB
 
@@ -66,12 +66,12 @@ class Watcher:
 
     @property
     def time(self) -> float:
-        """Stamp of the newest true state [s]; 0: nothing has come yet."""
+        """Stamp of the newest true state [s]; 0: nothing received yet."""
         state = self._value("ground_truth/odometry")
         return 0.0 if state is None else seconds(state.stamp)
 
     def situation(self) -> Situation | None:
-        """As it is now; None: not all has come yet."""
+        """As it is now; None: not everything received yet."""
         state, rotors, status = map(self._value, ("ground_truth/odometry", "rotor_state", "controller/status"))
         if state is None or rotors is None:
             return None

@@ -1,4 +1,4 @@
-"""Listens to a vehicle's graph for preflight, and gives the controller orders where it is allowed to."""
+"""Subscribes to a vehicle's graph for preflight, and commands the controller where this is allowed."""
 
 from __future__ import annotations
 
@@ -14,63 +14,63 @@ from perch_core.values import ControllerCommand, RotorState
 from perch_core.vehicle import Vehicle
 from perch_eval.nodes import in_namespace
 from perch_eval.camera_turns import CameraTurns
-from perch_eval.preflight.checks import ANSWER, Order
+from perch_eval.preflight.checks import RESPONSE_TIME, CommandResult
 from perch_eval.ros.graph_node import GraphNode
 
 COMMANDS = ("motor_command", "rates_thrust_command", "attitude_thrust_command")
 CHANNELS = ("imu/data_raw", "odometry", "camera_down/camera_info", "camera_front/camera_info", "controller/status", "rotor_state",
             "/tf_static", "/diagnostics", *COMMANDS)
-KEPT = 20_000       # values of a channel
-DEEP = 2000         # messages that wait while this program does not run
-TURNING = 0.02      # of its highest speed: a rotor that is faster turns
-SETTLING = 0.3      # after an effect, until the commands are looked at [s]
+MAX_VALUES = 20_000    # of a channel
+QUEUE_DEPTH = 2000     # messages that wait while this program does not run
+TURNING_SHARE = 0.02   # of its highest speed: a rotor that is faster turns
+SETTLING_TIME = 0.3    # after an effect, until the commands are checked [s]
 
 
 class GraphListener(GraphNode):
-    """Subscribes to everything that is judged.
+    """Subscribes to everything that is checked.
 
     Attributes:
-        values: channel -> (arrival by the wall clock [s], value), the newest `KEPT`.
-        turns: of the camera that is watched.
+        values: channel -> (arrival by the wall clock [s], value), the newest `MAX_VALUES`.
+        turns: rotations seen by the subscribed camera.
     """
 
     def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
         super().__init__("preflight", in_namespace(namespace))
         self.values: dict[str, list[tuple[float, Any]]] = {channel: [] for channel in CHANNELS}
         self.turns: CameraTurns | None = None
-        self._fastest = vehicle.speed_max
+        self._speed_max = vehicle.speed_max
         for channel in CHANNELS:
             row = topics.topic(channel)
             profile = copy(row.qos.subscribe)
-            profile.depth = max(profile.depth, DEEP)
-            self.node.create_subscription(row.message, channel, partial(self._take, channel, row), profile, raw=True)
-        order = topics.topic("controller/command")
-        self._orders = self.node.create_publisher(order.message, "controller/command", order.qos.publish)
+            profile.depth = max(profile.depth, QUEUE_DEPTH)
+            self.node.create_subscription(row.message, channel, partial(self._on_message, channel, row), profile, raw=True)
+        command = topics.topic("controller/command")
+        self._command_publisher = self.node.create_publisher(command.message, "controller/command", command.qos.publish)
 
-    def _take(self, channel: str, row: topics.Topic, data: bytes) -> None:
+    def _on_message(self, channel: str, row: topics.Topic, data: bytes) -> None:
         try:
             read = row.read(data)
         except PerchError:
             return
-        kept = self.values[channel]
-        kept += [(time.monotonic(), value) for value in (read if isinstance(read, list) else [read])]
-        del kept[:-KEPT]
+        values = self.values[channel]
+        values += [(time.monotonic(), value) for value in (read if isinstance(read, list) else [read])]
+        del values[:-MAX_VALUES]
 
-    def _look(self, row: topics.Topic, data: bytes) -> None:
+    def _on_image(self, row: topics.Topic, data: bytes) -> None:
         image = row.read(data)
         assert self.turns is not None
         self.turns.add(image.stamp, image.pixels())
 
-    def await_first(self, channel: str, patience: float) -> None:
+    def await_first(self, channel: str, timeout: float) -> None:
         """Until a channel's first value has come, or for so long [s]: nodes find each other in their own time."""
-        self.spin_until(lambda: self.values[channel], patience)
+        self.spin_until(lambda: self.values[channel], timeout)
 
-    def watch(self, camera: str, model: Camera) -> None:
-        """Look through a camera from now on."""
+    def subscribe_camera(self, camera: str, model: Camera) -> None:
+        """Measure the rotations of a camera from now on."""
         self.turns, row = CameraTurns(model), topics.topic(f"camera_{camera}/image_raw")
-        self.node.create_subscription(row.message, f"camera_{camera}/image_raw", partial(self._look, row), row.qos.subscribe, raw=True)
+        self.node.create_subscription(row.message, f"camera_{camera}/image_raw", partial(self._on_image, row), row.qos.subscribe, raw=True)
 
-    def stamped(self, channel: str) -> list[tuple[float, int]]:
+    def arrivals_and_stamps(self, channel: str) -> list[tuple[float, int]]:
         """Arrival [s] and stamp [ns] of everything on a channel."""
         return [(arrival, value.stamp) for arrival, value in self.values[channel]]
 
@@ -78,45 +78,46 @@ class GraphListener(GraphNode):
         """The newest value of a channel; None: there is none."""
         return self.values[channel][-1][1] if self.values[channel] else None
 
-    def order(self, command: int, state: int) -> Order:
-        """Give the controller an order, and wait for a state."""
+    def send_command(self, command: int, state: int) -> CommandResult:
+        """Send a command to the controller, and wait for a state."""
         stamp = getattr(self.newest("odometry"), "stamp", 0)
         row, begun = topics.topic("controller/command"), time.monotonic()
-        self._orders.publish(row.to_message(ControllerCommand(stamp, command, "preflight, props off")))
+        self._command_publisher.publish(row.to_message(ControllerCommand(stamp, command, "preflight, props off")))
         status = self.values["controller/status"]
-        self.spin_until(lambda: status and status[-1][0] > begun and status[-1][1].state == state, 2.0 * ANSWER)
+        self.spin_until(lambda: status and status[-1][0] > begun and status[-1][1].state == state, 2.0 * RESPONSE_TIME)
         delay = time.monotonic() - begun
-        self.listen(SETTLING)
+        self.spin_for(SETTLING_TIME)
         sent = [value for channel in COMMANDS for arrival, value in self.values[channel][-1:] if arrival > begun]
-        return Order(self.newest("controller/status"), delay, sent[-1].armed if sent else None)
+        return CommandResult(self.newest("controller/status"), delay, sent[-1].armed if sent else None)
 
-    def await_end_of_commands(self, patience: float) -> tuple[float | None, float | None]:
-        """When the last command came, and when a motor last turned after that [s]; see `checks.stopped`."""
-        end = time.monotonic() + patience
+    def await_end_of_commands(self, timeout: float) -> tuple[float | None, float | None]:
+        """When the last command came, and when a motor last turned after that [s]; see `checks.check_watchdog`."""
+        end = time.monotonic() + timeout
         while time.monotonic() < end:
-            self.listen(0.1)
+            self.spin_for(0.1)
             last = max((self.values[channel][-1][0] for channel in COMMANDS if self.values[channel]), default=None)
-            if last is not None and time.monotonic() - last > 3.0 * ANSWER:
-                told = [entry for source in self._motion(last) for entry in source]
-                return last, max((arrival for arrival, turns in told if turns), default=last) if told else None
+            if last is not None and time.monotonic() - last > 3.0 * RESPONSE_TIME:
+                reports = [entry for source in self._motor_reports(last) for entry in source]
+                return last, max((arrival for arrival, turns in reports if turns), default=last) if reports else None
         return None, None
 
-    def await_takeover(self, patience: float) -> tuple[bool, bool | None]:
-        """Whether the motors turned, and whether commands went on, armed, when they stopped; see `checks.taken_over`."""
+    def await_takeover(self, timeout: float) -> tuple[bool, bool | None]:
+        """Whether the motors turned, and whether commands went on, armed, when they stopped; see `checks.check_takeover`."""
         begun, turned = time.monotonic(), False
-        while time.monotonic() < begun + patience:
-            self.listen(0.1)
-            sources = self._motion(begun)
-            turned = any(turns for told in sources for _, turns in told)
-            if turned and not any(told[-1][1] for told in sources):
-                sent = [value.armed for channel in COMMANDS for arrival, value in self.values[channel][-1:] if time.monotonic() - arrival < SETTLING]
+        while time.monotonic() < begun + timeout:
+            self.spin_for(0.1)
+            sources = self._motor_reports(begun)
+            turned = any(turns for reports in sources for _, turns in reports)
+            if turned and not any(reports[-1][1] for reports in sources):
+                sent = [value.armed for channel in COMMANDS for arrival, value in self.values[channel][-1:]
+                        if time.monotonic() - arrival < SETTLING_TIME]
                 return True, any(sent)
         return turned, None
 
-    def _motion(self, since: float) -> list[list[tuple[float, bool]]]:
-        """What each source has told since a time [s] of the motors: when, and whether they turn; without sources that are silent."""
+    def _motor_reports(self, since: float) -> list[list[tuple[float, bool]]]:
+        """Reports of the motors by each source since a time [s]: arrival, and whether they turn; sources without reports are left out."""
         rotors: list[tuple[float, RotorState]] = [entry for entry in self.values["rotor_state"] if entry[0] > since]
-        turning = [(arrival, max(state.speed) > TURNING * self._fastest) for arrival, state in rotors]
-        armed = [(arrival, str(said.values["armed"]).lower() == "true") for arrival, said in self.values["/diagnostics"]
-                 if arrival > since and "armed" in said.values]
-        return [told for told in (turning, armed) if told]
+        turning = [(arrival, max(state.speed) > TURNING_SHARE * self._speed_max) for arrival, state in rotors]
+        armed = [(arrival, str(status.values["armed"]).lower() == "true") for arrival, status in self.values["/diagnostics"]
+                 if arrival > since and "armed" in status.values]
+        return [reports for reports in (turning, armed) if reports]

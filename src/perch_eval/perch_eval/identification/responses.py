@@ -1,4 +1,4 @@
-"""Commands to an inner loop and their answers: measured, by a model, and drawn."""
+"""Commands to an inner loop and their responses: measured, by a model, and drawn."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from matplotlib.figure import Figure
 
 from perch_core.vehicle import Vehicle
 from perch_eval.flight import Flight
-from perch_eval.flight_view import ESTIMATE, TRUTH, WANTED
+from perch_eval.flight_view import ESTIMATE, REFERENCE, TRUTH
 from perch_eval.metrics import perch_window
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A command and its answer over time, for the page: title, unit, t [s], command, measured, model, each (n,)."""
+class Response:
+    """A command and its response over time, for the page: title, unit, t [s], command, measured, model, each (n,)."""
 
     title: str
     unit: str
@@ -33,35 +33,35 @@ class Answer:
         return 1.0 - max(float(np.var(error)) - noise, 0.0) / max(float(np.var(self.measured)) - noise, 1e-12)
 
 
-def lagged(u: np.ndarray, lag: float, period: float) -> np.ndarray:
+def first_order_lag(u: np.ndarray, lag: float, period: float) -> np.ndarray:
     """First-order lag of a command given at each sample, (n, ...), and its mean from one to the next; it begins settled."""
-    from scipy.signal import lfilter  # 0.3 s of imports, which a report without an inner loop does without
+    from scipy.signal import lfilter  # 0.3 s of imports, not needed for a report without an inner loop
 
     fade = exp(-period / max(lag, 1e-6))
     half = 0.5 * (1.0 - fade)
     return lfilter([half, half], [1.0, -fade], u, axis=0, zi=(1.0 - half) * u[:1])[0]
 
 
-def answers_figure(answers: Sequence[Answer], names: Sequence[str] = ()) -> Figure:
-    """One row per answer: command, measured and model over time, and beside it measured over model.
+def response_figure(responses: Sequence[Response], names: Sequence[str] = ()) -> Figure:
+    """One row per response: command, measured and model over time, and beside it measured over model.
 
     Args:
-        answers: what is drawn.
+        responses: what is drawn.
         names: of the models; by default how much of the measured variance each explains.
     """
-    figure = Figure(figsize=(13, 2.8 * len(answers)), layout="constrained")
-    axes = figure.subplots(len(answers), 2, squeeze=False, gridspec_kw={"width_ratios": [4, 1]})
-    for k, ((left, right), answer) in enumerate(zip(axes, answers)):
-        label = names[k] if names else f"model, explains {100 * answer.explained:.1f} %"
-        left.plot(answer.t, answer.measured, color=TRUTH, lw=0.6, label="measured")
-        left.plot(answer.t, answer.command, color=WANTED, lw=0.8, label="commanded")
-        left.plot(answer.t, answer.model, color=ESTIMATE, lw=1.0, ls="--", label=label)
-        left.set_ylabel(f"{answer.title} [{answer.unit}]")
+    figure = Figure(figsize=(13, 2.8 * len(responses)), layout="constrained")
+    axes = figure.subplots(len(responses), 2, squeeze=False, gridspec_kw={"width_ratios": [4, 1]})
+    for k, ((left, right), response) in enumerate(zip(axes, responses)):
+        label = names[k] if names else f"model, explains {100 * response.explained:.1f} %"
+        left.plot(response.t, response.measured, color=TRUTH, lw=0.6, label="measured")
+        left.plot(response.t, response.command, color=REFERENCE, lw=0.8, label="commanded")
+        left.plot(response.t, response.model, color=ESTIMATE, lw=1.0, ls="--", label=label)
+        left.set_ylabel(f"{response.title} [{response.unit}]")
         left.legend(loc="upper right", fontsize=7)
-        right.plot(answer.model, answer.measured, ".", ms=1.5, color=TRUTH)
-        ends = np.array([answer.model.min(), answer.model.max()])
+        right.plot(response.model, response.measured, ".", ms=1.5, color=TRUTH)
+        ends = np.array([response.model.min(), response.model.max()])
         right.plot(ends, ends, color=ESTIMATE, lw=1.0)
-        right.set(xlabel=f"model [{answer.unit}]", ylabel="measured")
+        right.set(xlabel=f"model [{response.unit}]", ylabel="measured")
         for axis in (left, right):
             axis.grid(alpha=0.3)
     axes[-1, 0].set_xlabel("time [s]")
@@ -69,7 +69,7 @@ def answers_figure(answers: Sequence[Answer], names: Sequence[str] = ()) -> Figu
 
 
 def inner_loop_figure(flight: Flight, vehicle: Vehicle) -> Figure | None:
-    """Commands of rates and thrust through the perch, what the IMU reads, and the answer of the model that the vehicle file has.
+    """Commands of rates and thrust through the perch, IMU readings, and the response of the model in the vehicle file.
 
     Returns:
         None where the vehicle takes no rates, or the flight has none.
@@ -83,9 +83,9 @@ def inner_loop_figure(flight: Flight, vehicle: Vehicle) -> Figure | None:
     measured = np.array([(*np.degrees(sample.w_B), sample.f_B[2]) for _, sample in imu])
     period, shown = float(np.median(np.diff(t))), (t >= window[0] - 0.5) & (t <= window[1])
     rows = [(f"rate {'xyz'[i]}", "deg/s", a.rate_gain[i], a.rate_lag[i]) for i in range(3)]
-    answers, names = [], []
+    responses, names = [], []
     for i, (title, unit, gain, lag) in enumerate([*rows, ("thrust / mass", "m/s^2", a.thrust_gain, a.thrust_lag)]):
-        model = lagged(gain * np.interp(t - a.delay - period, command_t, command[:, i]), lag, period)
-        answers.append(Answer(title, unit, t[shown], np.interp(t[shown], command_t, command[:, i]), measured[shown, i], model[shown]))
+        model = first_order_lag(gain * np.interp(t - a.delay - period, command_t, command[:, i]), lag, period)
+        responses.append(Response(title, unit, t[shown], np.interp(t[shown], command_t, command[:, i]), measured[shown, i], model[shown]))
         names.append(f"model: gain {gain:.3f}, lag {1e3 * lag:.0f} ms, delay {1e3 * a.delay:.0f} ms")
-    return answers_figure(answers, names)
+    return response_figure(responses, names)

@@ -1,4 +1,4 @@
-"""What single images show: tags and the board, wires; without an IMU, and where there is no calibration without a camera either."""
+"""Detections in single images: tags, board and wires, without an IMU; a camera without calibration is guessed."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from perch_core.camera import Camera, PinholeCamera
 from perch_core.camera_mount import CameraMount
 from perch_core.tag_board import FAMILIES, Tag, TagBoard
 from perch_core.values import CameraImage, TargetPose
-from perch_eval.recordings.drawing import Shown, canvas, caption, draw_board, draw_tags, draw_wires
+from perch_eval.recordings.drawing import GalleryImage, canvas, caption, draw_board, draw_tags, draw_wires
 from perch_perception.images import mono_image, rgb_image
 from perch_perception.line_mapping import LineDetectionConfig, LineSighting, detect_lines
 from perch_perception.tags import BoardLocalizer, BoardPose, Localization, TagDetector, refine_corners
 
-GUESSED_FOCAL = 0.8  # of a camera that nobody has calibrated, as a share of the image's width
+GUESSED_FOCAL = 0.8  # of a camera without calibration, as a share of the image's width
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What one image shows.
+class ImageDetections:
+    """Tags, board and wires detected in one image.
 
     Attributes:
         tags: numbers and corners [px], shape (4, 2), of all tags of the family.
         board: pose of the board in the camera; None: it was not found.
-        message: why it was not, for people.
+        message: why it was not.
         wires: arcs of straight wires.
-        mount: the camera, guessed where nobody calibrated it.
+        mount: the camera, guessed if it is not calibrated.
     """
 
     tags: Sequence[tuple[int, np.ndarray]]
@@ -57,15 +57,15 @@ def guessed_mount(name: str, width: int, height: int) -> CameraMount:
     return CameraMount(name, PinholeCamera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), np.zeros(3), np.eye(3))
 
 
-def look(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDetectionConfig, calibrated: bool) -> Seen:
-    """Look at one image.
+def detect(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDetectionConfig, calibrated: bool) -> ImageDetections:
+    """Detect tags, board and wires in one image.
 
     Args:
         image: of the camera's size.
         mount: the camera.
-        board: whose pose is wanted.
+        board: whose pose is estimated.
         wires: what counts as a wire.
-        calibrated: the camera is known; otherwise no pose can be told.
+        calibrated: the camera is known; otherwise no pose is estimated.
 
     Raises:
         ImageError: it is not of the camera's size or has no pixels.
@@ -74,7 +74,7 @@ def look(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDet
     tags = find_tags(grey, mount.camera, board)
     found = BoardLocalizer(board, mount).process(grey, 0.0) if calibrated else Localization(None, message="the camera is not calibrated: no pose")
     pixels = rgb_image(image, mount.camera) if wires.appearance == "red" else grey
-    return Seen(tags, found.board, found.message, detect_lines(pixels, mount.camera, wires), mount)
+    return ImageDetections(tags, found.board, found.message, detect_lines(pixels, mount.camera, wires), mount)
 
 
 def find_tags(grey: np.ndarray, camera: Camera, board: TagBoard) -> list[tuple[int, np.ndarray]]:
@@ -86,14 +86,14 @@ def find_tags(grey: np.ndarray, camera: Camera, board: TagBoard) -> list[tuple[i
     return list(zip(detection.ids, pixels))
 
 
-def drawn(image: CameraImage, seen: Seen, board: TagBoard, name: str) -> Shown:
+def draw_detections(image: CameraImage, detections: ImageDetections, board: TagBoard, name: str) -> GalleryImage:
     """The image with what was found in it."""
-    picture = canvas(mono_image(image, seen.mount.camera))
-    draw_wires(picture, seen.mount.camera, seen.wires)
-    draw_tags(picture, seen.tags)
-    text = f"{name}: {len(seen.tags)} tags, {len(seen.wires)} wires"
-    if seen.board is not None:
-        pose = TargetPose(image.stamp, seen.board.p_CS, so3.quat_from_matrix(seen.board.R_CS), seen.board.covariance)
-        draw_board(picture, seen.mount.camera, board, pose, seen.board.ids)
-        text += f", board at {np.linalg.norm(seen.board.p_CS):.2f} m"
-    return Shown(image.stamp, text, caption(picture, text[:80]))
+    picture = canvas(mono_image(image, detections.mount.camera))
+    draw_wires(picture, detections.mount.camera, detections.wires)
+    draw_tags(picture, detections.tags)
+    text = f"{name}: {len(detections.tags)} tags, {len(detections.wires)} wires"
+    if detections.board is not None:
+        pose = TargetPose(image.stamp, detections.board.p_CS, so3.quat_from_matrix(detections.board.R_CS), detections.board.covariance)
+        draw_board(picture, detections.mount.camera, board, pose, detections.board.ids)
+        text += f", board at {np.linalg.norm(detections.board.p_CS):.2f} m"
+    return GalleryImage(image.stamp, text, caption(picture, text[:80]))

@@ -9,10 +9,10 @@ from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, OdometryState, PowerlineMap, TargetPose, seconds
 from perch_control.mission.values import Target
 
-AHEAD = NANOSECONDS // 10  # a stamp is no more than this ahead of the newest sample [ns]
+FUTURE_TOLERANCE = NANOSECONDS // 10  # a stamp is no more than this ahead of the newest sample [ns]
 
 
-class Sightings:
+class Targets:
     """Owns the newest pose of the pad and the newest map.
 
     Attributes:
@@ -33,7 +33,7 @@ class Sightings:
         """
         if x is None:
             return "there is no odometry yet"
-        if pose.stamp > newest + AHEAD:
+        if pose.stamp > newest + FUTURE_TOLERANCE:
             return "its stamp is in the future"
         if self._pad is not None and pose.stamp < self._pad[0].stamp:
             return "it is older than the newest"
@@ -51,7 +51,7 @@ class Sightings:
 
     def take_lines(self, lines: PowerlineMap, newest: int | None) -> str:
         """Keep a map, or return why it is refused; `newest` as in `take_pad`, None before the first stamp."""
-        if newest is None or lines.stamp > newest + AHEAD:
+        if newest is None or lines.stamp > newest + FUTURE_TOLERANCE:
             return "its stamp is in the future"
         if self.lines is not None and lines.stamp < self.lines.stamp:
             return "it is older than the newest"

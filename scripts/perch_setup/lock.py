@@ -9,20 +9,20 @@ from typing import Iterator
 
 from .layout import STATE
 
-_held: list[int] = []
+_descriptors: list[int] = []
 
 
-def held() -> tuple[int, ...]:
+def descriptors() -> tuple[int, ...]:
     """Return the file descriptors of the lock, to be passed on to pip and colcon.
 
     The kernel releases the lock when its last holder ends. As the tools hold it as well, the lock of a killed
     set-up is kept until they have ended, and the next set-up does not write to the same files.
     """
-    return tuple(_held)
+    return tuple(_descriptors)
 
 
 @contextlib.contextmanager
-def alone() -> Iterator[None]:
+def setup_lock() -> Iterator[None]:
     """Hold the lock of this repository's set-up."""
     STATE.mkdir(exist_ok=True)
     with (STATE / "lock").open("w") as file:
@@ -31,8 +31,8 @@ def alone() -> Iterator[None]:
         except BlockingIOError:
             print("perch set-up: another process is setting up; waiting for it", file=sys.stderr)
             fcntl.flock(file, fcntl.LOCK_EX)
-        _held.append(file.fileno())
+        _descriptors.append(file.fileno())
         try:
             yield
         finally:
-            _held.clear()
+            _descriptors.clear()

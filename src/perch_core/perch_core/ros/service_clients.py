@@ -12,9 +12,9 @@ from perch_core.ros import topics
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-DISCOVERY = 5.0  # without a server for so long, a request is given up; a node that was just started finds it later [s]
-LOOK = 0.1       # between two looks for servers while a request is open [s]
-WATCH = 1.0      # between two looks at who would answer [s]
+DISCOVERY_TIMEOUT = 5.0  # a request fails after so long without a server; a node that has just started discovers it later [s]
+CHECK_PERIOD = 0.1       # of the check for servers while a request is open [s]
+WATCH_PERIOD = 1.0       # of the check for new servers [s]
 
 Deliver = Callable[[Client[Any, Any], Any], None]
 
@@ -24,8 +24,8 @@ def connect_clients(node: Node, component: Component[Any], deliver: Deliver) -> 
     for port in ports(type(component), Client):
         row = topics.service(port.channel(component))
         client = node.create_client(row.type, port.channel(component))
-        setattr(component, port.name, _asker(node, port, row, client, deliver))
-        _watch(node, component, client)
+        setattr(component, port.name, _client_function(node, port, row, client, deliver))
+        _watch_servers(node, component, client)
 
 
 def _servers(node: Node, client: Any) -> set[bytes]:
@@ -34,24 +34,24 @@ def _servers(node: Node, client: Any) -> set[bytes]:
     return {bytes(info.endpoint_gid) for info in node.get_publishers_info_by_topic(replies, no_mangle=True)}
 
 
-def _watch(node: Node, component: Component[Any], client: Any) -> None:
+def _watch_servers(node: Node, component: Component[Any], client: Any) -> None:
     """Warn when another server appears, also while no request is open: a restarted server has lost its state."""
     known = set[bytes]()
 
-    def look() -> None:
+    def check() -> None:
         servers = _servers(node, client)
         if known and not servers <= known:
-            component.warn(f"{client.srv_name}: another node answers from now on: it was started anew, or is a second one")
+            component.warn(f"{client.srv_name}: server restarted or second server detected")
         known.update(servers)
 
-    node.create_timer(WATCH, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    node.create_timer(WATCH_PERIOD, check, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def _asker(node: Node, port: Client[Any, Any], row: topics.ServiceRow, client: Any, deliver: Deliver) -> Callable[[Any, int], None]:
+def _client_function(node: Node, port: Client[Any, Any], row: topics.ServiceRow, client: Any, deliver: Deliver) -> Callable[[Any, int], None]:
     """Return a function that sends a request to every server that appears until one has answered: a server may be restarted."""
-    def ask(request: Any, due: int) -> None:
-        message, asked, calls = row.request_message(request), set[bytes](), list[Any]()
-        unanswered, seen = True, time.monotonic()
+    def send_request(request: Any, due: int) -> None:
+        message, requested, calls = row.request_message(request), set[bytes](), list[Any]()
+        unanswered, last_available = True, time.monotonic()
 
         def finish(answer: Any) -> None:
             nonlocal unanswered
@@ -62,22 +62,22 @@ def _asker(node: Node, port: Client[Any, Any], row: topics.ServiceRow, client: A
                     client.remove_pending_request(call)
                 deliver(port, answer)
 
-        def look() -> None:
-            nonlocal seen
+        def check() -> None:
+            nonlocal last_available
             if client.service_is_ready():
-                seen = time.monotonic()
+                last_available = time.monotonic()
                 servers = _servers(node, client)
-                if not calls or not servers <= asked:
-                    asked.update(servers)
+                if not calls or not servers <= requested:
+                    requested.update(servers)
                     calls.append(client.call_async(message))
                     calls[-1].add_done_callback(lambda done: finish(_answer(row, done)))
-            elif time.monotonic() - seen > DISCOVERY:
-                finish(Unavailable(f"service {client.srv_name} is not there"))
+            elif time.monotonic() - last_available > DISCOVERY_TIMEOUT:
+                finish(Unavailable(f"service {client.srv_name} is not available"))
 
-        timer = node.create_timer(LOOK, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        look()
+        timer = node.create_timer(CHECK_PERIOD, check, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        check()
 
-    return ask
+    return send_request
 
 
 def _answer(row: topics.ServiceRow, future: Any) -> Any:
@@ -88,4 +88,4 @@ def _answer(row: topics.ServiceRow, future: Any) -> Any:
     try:
         return row.answer_value(response)
     except PerchError as error:
-        return Unavailable(f"{row.channel} answered nonsense: {error}")
+        return Unavailable(f"{row.channel} sent an invalid response: {error}")
