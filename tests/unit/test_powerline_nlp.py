@@ -50,7 +50,7 @@ def test_clearance_constraint_is_the_scaled_distance() -> None:
     for _ in range(30):
         x = state(LINE.centre + rng.normal(0, 0.4, 3), so3.quat_exp(rng.normal(size=3)))
         d = 1 + lines.scaled_clearance(x[None, :3], x[None, 3:7], LINE, VEHICLE.body_radii)[0]
-        value = float(STAGES.functions["clear"](x, line_parameters(LINE)))
+        value = float(STAGES.functions["clearance"](x, line_parameters(LINE)))
         assert value == pytest.approx((d * d - 1) / (d * d + 1), abs=1e-6)
 
 
@@ -58,14 +58,14 @@ def test_perception_cost_grows_as_the_camera_turns_away_even_past_the_line() -> 
     """[P:eq13] with the authors' arctan is flat where the camera looks along the line; a solver would never turn."""
     line, weights = line_parameters(Segment([4.0, 0, 4.0], [0, 1, 0], 2.0, 0.03)), [0.0, 0.0, 1.0]
     yaws = np.radians([0, 10, 60, 80, 89, 100, 130, 170])
-    costs = [float(STAGES.functions["see"](state([0, 0, 4.0], so3.quat_exp([0, 0, yaw])), line, weights)) for yaw in yaws]
+    costs = [float(STAGES.functions["perception"](state([0, 0, 4.0], so3.quat_exp([0, 0, yaw])), line, weights)) for yaw in yaws]
     assert costs[0] == costs[1] == 0.0  # the centred point is on the segment: its inner half subtends 14 deg to either side
     assert np.all(np.diff(costs[1:]) > 0.05)
 
 
 def test_gauss_newton_has_the_gradient_and_never_bends_down() -> None:
     rng, line, weights = np.random.default_rng(4), line_parameters(LINE), [50.0, 100.0, 100.0]
-    sparsity = STAGES.hessian["see"]
+    sparsity = STAGES.hessian["perception"]
 
     def second(name: str, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         values = np.array(STAGES.functions[name](x, line, weights, 1.0)).ravel()
@@ -75,7 +75,7 @@ def test_gauss_newton_has_the_gradient_and_never_bends_down() -> None:
     least = []
     for _ in range(30):
         x = state(LINE.centre + rng.normal(0, 2.0, 3), so3.quat_exp(rng.normal(size=3)))
-        (exact, curvature), (gradient, never) = second("see_hess", x), second("see_gauss_newton", x)
+        (exact, curvature), (gradient, never) = second("perception_hess", x), second("perception_gauss_newton", x)
         np.testing.assert_allclose(gradient, exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
         assert never.min() > -1e-9 * never.max()
         least.append(curvature.min() / np.abs(curvature).max())
@@ -95,7 +95,7 @@ def test_spin_between_the_nodes_sees_a_peak_that_both_nodes_miss() -> None:
     x[13:17] = [3.1, 0.7, 0.7, 3.1]
     step = float(1 / 30)
     after = np.array(STAGES.functions["step"](x, u, step)).ravel()
-    middle = float(STAGES.functions["turn"](x, u, step, 7.0))
+    middle = float(STAGES.functions["body_rate_between"](x, u, step, 7.0))
     fine = np.array(STAGES.functions["step"](x, u, step / 2)).ravel()
     assert middle == pytest.approx(1 - fine[10:13] @ fine[10:13] / 49, abs=1e-6)
     assert np.abs(after[11] - x[11]) < np.abs(fine[11] - x[11])  # the middle is farther out than the end

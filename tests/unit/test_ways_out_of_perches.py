@@ -15,7 +15,7 @@ from perch_control.modes import Command, State
 from perch_control.reference import FlatReference
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import GRAVITY, load_vehicle
-from perch_eval.control_flights.aborted import fly_aborted
+from perch_eval.control_flights.aborted import fly_cancelled
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState
 from perch_planner.refusals import PerchRefusal
 from perch_planner.way_out import STANDOFF_MIN, plan_way_out
@@ -68,13 +68,13 @@ def test_a_plan_is_committed_once_no_way_out_is_left():
 
 @pytest.mark.parametrize("before", [1.2, 0.25])
 def test_a_cancelled_perch_leaves_by_a_way_out_and_ends_in_a_hover(before):
-    flown = fly_aborted("surface_90", 1, before)
+    flown = fly_cancelled("surface_90", 1, before)
     assert flown.planned and flown.end == "hovering" and flown.message == "cancelled; hovering"
     assert flown.rate < VEHICLE.body_rate_max and flown.margin > 0.0 and flown.distance > 0.0
 
 
 def test_cancelled_too_late_the_perch_goes_on():
-    flown = fly_aborted("surface_90", 1, 0.1)
+    flown = fly_cancelled("surface_90", 1, 0.1)
     assert flown.end == "attached" and flown.message.startswith("cancelled too late")
 
 

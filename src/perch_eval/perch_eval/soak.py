@@ -1,4 +1,4 @@
-"""The stack for hours: perch, depart, perch again, in one run; memory, descriptors, threads and shared memory of every process."""
+"""Run the stack for hours (perch, depart, perch again); record memory, descriptors, threads and shared memory."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Sample:
 
     Attributes:
         rss: resident memory [MB].
-        descriptors, threads: how many.
+        descriptors, threads: their numbers.
     """
 
     rss: float
@@ -58,15 +58,15 @@ class Sample:
 
 @dataclass(frozen=True)
 class Flight:
-    """One perch and what came after it.
+    """One perch and the departure after it.
 
     Attributes:
         time: simulation time at its end [s].
-        outcome: of the goal, `perched` if it succeeded.
-        departed: the vehicle has left for a hover.
-        words: the error message; empty: none.
+        outcome: of the goal; `perched` is success.
+        departed: whether the vehicle has left for a hover.
+        words: message of the failure; empty: none.
         processes: name -> its sample.
-        shared: in /dev/shm, of all processes of this machine [MB].
+        shared: size of /dev/shm, with the files of all users [MB].
     """
 
     time: float
@@ -78,33 +78,33 @@ class Flight:
 
 
 def sample(pid: int) -> Sample:
-    """A process as it is now."""
+    """Return a sample of a process."""
     process = psutil.Process(pid)
     return Sample(round(process.memory_info().rss / 1e6, 3), process.num_fds(), process.num_threads())
 
 
 def slope(values: Sequence[float]) -> float | None:
-    """Growth per 100 flights after the first ones, by least squares; None: too few to tell."""
+    """Return the growth per 100 flights, without the first `SETTLED`, by least squares; None if there are too few flights."""
     rest = np.asarray(values[WARM_UP_FLIGHTS:], float)
     return float(100.0 * np.polyfit(np.arange(len(rest)), rest, 1)[0]) if len(rest) >= 20 else None
 
 
 def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: float, flights: int | None, folder: Path,
         save: Callable[[Sequence[Flight]], object]) -> list[Flight]:
-    """Fly until there has been so much simulated time, or so many flights.
+    """Fly until a simulated time or number of flights is reached, failures repeat, or the stack fails.
 
     Args:
         name: of the scenario.
         seed: of every random number.
-        cameras: render and process images; otherwise they are replaced by error models.
+        cameras: render and process images; otherwise error models replace them.
         composed: nodes that share a process.
         hours: of simulated time.
-        flights: at most so many; None: as time allows.
+        flights: maximum number of flights; None: no limit.
         folder: receives logs and parameters.
-        save: receives the flights so far, regularly, so that they are not lost if this process is killed.
+        save: called every `SAVE_EVERY` flights with all flights so far, to save them.
 
     Raises:
-        PerchError: the stack does not come up, or breaks.
+        PerchError: scenario or nodes are refused, the workspace is not built, or no ROS domain is free.
     """
     source = config.find("scenarios", name)
     scenario = load_scenario(source)
@@ -149,7 +149,7 @@ def _fly_once(client: MissionClient, scenario: Any, stack: Stack) -> Flight:
 
 
 def growth(flights: Sequence[Flight]) -> dict[str, dict[str, Any]]:
-    """Growth of each process: its slope [MB per 100 flights], and the range of descriptors and threads after the first flights."""
+    """Return memory, its slope [MB per 100 flights], and the later range of descriptors and threads, of each process."""
     found = {}
     for name in flights[0].processes:
         own = [flight.processes[name] for flight in flights]
@@ -161,7 +161,7 @@ def growth(flights: Sequence[Flight]) -> dict[str, dict[str, Any]]:
 
 
 def find_problems(flights: Sequence[Flight]) -> list[str]:
-    """Problems of the flights, one line each."""
+    """Return the problems found, one line each."""
     found = [f"flight {k + 1}: {flight.outcome}{'' if flight.departed else ', no departure'}: {flight.words}"
              for k, flight in enumerate(flights) if not flight.departed or flight.outcome != "perched"]
     for name, figures in growth(flights).items():
@@ -194,7 +194,7 @@ def plot(flights: Sequence[Flight], file: Path) -> None:
 
 
 def page(folder: Path) -> str:
-    """The page of all soaks whose figures lie in a folder."""
+    """Return the page of all soak runs whose results are in a folder."""
     runs = {file: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
     text = ["# Soak", "", banner([run["commit"] for run in runs.values()], [run.get("digest", "") for run in runs.values()]), "",
             "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart,",
@@ -221,7 +221,7 @@ def page(folder: Path) -> str:
 
 
 def _grouped(problems: list[str]) -> list[str]:
-    """Equal problems of several flights as one."""
+    """Merge equal problems of several flights."""
     flights: dict[str, list[str]] = {}
     for problem in problems:
         flight, _, text = problem.removeprefix("flight ").partition(": ") if problem.startswith("flight ") else ("", "", problem)
@@ -262,7 +262,7 @@ def _soak(args: argparse.Namespace) -> int:
 
 
 def _write(args: argparse.Namespace, code: Mapping[str, str], began: float, flights: Sequence[Flight]) -> list[str]:
-    """Write figures and page of what has been flown; returns the problems."""
+    """Write figures and page of the flights so far; return the problems found."""
     name, problems = args.name or Path(args.scenario).stem, find_problems(flights)
     plot(flights, args.out / f"{name}.png")
     (args.out / f"{name}.json").write_text(json.dumps({

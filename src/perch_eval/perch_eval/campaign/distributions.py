@@ -35,7 +35,7 @@ class Distribution:
         return f"{self.kind} {list(self.values)}{limits}"
 
     def draw(self, rng: np.random.Generator) -> Any:
-        """One value; a grid is not drawn but gone through."""
+        """One value; a grid is not drawn but iterated."""
         if self.kind == "choice":
             return self.values[int(rng.integers(len(self.values)))]
         if self.kind == "uniform":
@@ -44,7 +44,7 @@ class Distribution:
             value = float(rng.normal(*self.values))
             if self.low <= value <= self.high:
                 return value
-        raise ConfigError("campaign", "normal", f"[{self.low:g}, {self.high:g}] is hardly ever met by normal{self.values}")
+        raise ConfigError("campaign", "normal", f"[{self.low:g}, {self.high:g}] is almost never drawn by normal{self.values}")
 
 
 def parse(source: str, key: str, entry: Any) -> Distribution:
@@ -63,7 +63,7 @@ def parse(source: str, key: str, entry: Any) -> Distribution:
     kind, values = kinds[0], entry[kinds[0]]
     if not isinstance(values, list) or not values:
         raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not a list")
-    if len({_sort(v) for v in values}) > 1 or "" in map(_sort, values):
+    if len({_kind(v) for v in values}) > 1 or "" in map(_kind, values):
         raise ConfigError(source, f"{key}.{kind}", f"{values!r} are not all numbers (of at most {FALLBACK_BOUND:g}), words, true or false, or vectors")
     if kind in ("uniform", "normal"):
         if len(values) != 2 or not all(_is_number(v) for v in values):
@@ -91,8 +91,8 @@ def parse_seed(source: str, key: str, entry: Any) -> Distribution:
     return found
 
 
-def _sort(value: Any) -> str:
-    """What values of one quantity have in common; empty: what none can have."""
+def _kind(value: Any) -> str:
+    """The kind of a value, equal for all values of one quantity; empty: not allowed."""
     if isinstance(value, list):
         return f"{len(value)} numbers" if value and all(map(_is_number, value)) else ""
     return "number" if _is_number(value) else type(value).__name__ if isinstance(value, (str, bool)) else ""

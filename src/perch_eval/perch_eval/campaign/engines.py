@@ -49,7 +49,7 @@ class Task:
     @classmethod
     def from_campaign(cls, campaign: Campaign, run: Run, report_folder: str = "") -> Task:
         """A run of a campaign."""
-        return cls(run, campaign.mapping(run), campaign.engine, campaign.sensing, keep)
+        return cls(run, campaign.mapping(run), campaign.engine, campaign.sensing, report_folder)
 
 
 def resolve(name: str) -> Callable[[Task], RunResult]:

@@ -102,8 +102,8 @@ def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]
             continue
         top = float(np.percentile(everything, 99)) or 1.0
         edges = np.linspace(min(0.0, min(everything)), max(top, 1e-9), 25)
-        axes.hist([np.minimum(group, edges[-1]) for group in groups], bins=edges, stacked=True, color=[SUCCESS_COLOR, FAILURE_COLOR],
-                  label=["perched", "failed"])
+        axes.hist([np.minimum(group, edges[-1]) for group in groups], bins=edges, stacked=True,
+                  color=[SUCCESS_COLOR, FAILURE_COLOR], label=["perched", "failed"])
         axes.axvline(float(np.median(everything)), color="k", lw=0.8, ls="--", label="median")
         axes.yaxis.get_major_locator().set_params(integer=True)
         if max(everything) > edges[-1]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from perch_eval.campaign import figures
 from perch_eval.campaign.causes import MEANING, SUCCESS
 from perch_eval.campaign.results import RunResult, flight_folder, worst
-from perch_eval.campaign.specification import Campaign, in_words
+from perch_eval.campaign.specification import Campaign, values_text
 from perch_eval.metrics import FIGURES
 from perch_eval.page import Html, image, page, section, table, text
 from perch_eval.statistics import Rate, Spread
@@ -75,7 +75,7 @@ def _spreads(found: Sequence[RunResult], present: dict[str, tuple[str, float]]) 
 def _flights(found: Sequence[RunResult], folder: Path) -> str:
     shown = [r for r in found if r.cause != SUCCESS][:200]
     kept = [r for r in found if r.cause == SUCCESS and (folder / flight_folder(r.number) / "report.html").exists()]
-    return table(((Html(_link(r, folder)), r.seed, r.cause, r.message, in_words(r.values))
+    return table(((Html(_link(r, folder)), r.seed, r.cause, r.message, values_text(r.values))
                   for r in (*shown, *kept)), ("run", "seed", "cause", "message", "conditions"))
 
 

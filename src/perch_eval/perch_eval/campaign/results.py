@@ -101,11 +101,11 @@ def severity(result: RunResult) -> float:
     """How far from a good contact a flight was; larger is worse. Flights without a contact count by their tracking."""
     m = result.metrics
 
-    def of(name: str) -> float:
+    def metric(name: str) -> float:
         return m.get(name) or 0.0
 
-    return (of("contact_tilt_error_deg") / 15.0 + of("contact_tangential_speed_m_s") / 0.6 + of("contact_offset_m") / 0.3
-            + sum(of(f"tracking_rmse_m_{axis}") for axis in "xyz") / 0.3)
+    return (metric("contact_tilt_error_deg") / 15.0 + metric("contact_tangential_speed_m_s") / 0.6 + metric("contact_offset_m") / 0.3
+            + sum(metric(f"tracking_rmse_m_{axis}") for axis in "xyz") / 0.3)
 
 
 def worst(found: list[RunResult], count: int) -> list[RunResult]:

@@ -68,7 +68,7 @@ class Campaign:
         base: the scenario's mapping, before the variation.
         vary: varied name -> distribution.
         runs: what is flown.
-        digest: SHA-256 of everything that decides the results.
+        digest: SHA-256 of everything that determines the results.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Campaign:
         """The scenario's mapping of a run, as a scenario file holds it."""
         out = copy.deepcopy(self.base)
         for name, value in run.values.items():
-            place(out, name, value)
+            set_value(out, name, value)
         return out
 
 
@@ -117,9 +117,9 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
         raise ConfigError(str(file), "runs", f"{flights} flights on all points of the grids are more than {RUNS_MAX}")
     drawn = _draw(vary, runs or content.runs, content.seed)
     axes = content.map or tuple(mappable[:2])
-    decisive = json.dumps([engine, asdict(content.sensing), base, [[r.number, r.seed, r.values] for r in drawn]], sort_keys=True, default=str)
+    digest_input = json.dumps([engine, asdict(content.sensing), base, [[r.number, r.seed, r.values] for r in drawn]], sort_keys=True, default=str)
     campaign = Campaign(content.name, content.description, engine, content.sensing, axes if len(axes) == 2 else (),
-                        content.keep_worst, base, vary, drawn, hashlib.sha256(decisive.encode()).hexdigest())
+                        content.keep_worst, base, vary, drawn, hashlib.sha256(digest_input.encode()).hexdigest())
     _check(campaign, str(file))
     return campaign
 
@@ -134,19 +134,19 @@ def _check(campaign: Campaign, file: str) -> None:
     parameters: dict[str, Any] = {}
     different = {json.dumps(run.values): run for run in reversed(campaign.runs)}
     for run in sorted(different.values(), key=lambda run: run.number):
-        source = f"{file}: run {run.number} ({in_words(run.values)})"
+        source = f"{file}: run {run.number} ({values_text(run.values)})"
         scenario = config.from_mapping(Scenario, campaign.mapping(run), source)
-        named = scenario.vehicle, scenario.target.board
-        if named not in vehicles:
-            vehicles[named] = check_names(scenario, source)
+        names = scenario.vehicle, scenario.target.board
+        if names not in vehicles:
+            vehicles[names] = check_names(scenario, source)
         if campaign.engine == "stack":
-            check_flight(scenario, source, vehicles[named])
+            check_flight(scenario, source, vehicles[names])
         if scenario.parameters != parameters:
             check_parameters(scenario, source)
             parameters = scenario.parameters
 
 
-def place(mapping: dict[str, Any], name: str, value: Any) -> None:
+def set_value(mapping: dict[str, Any], name: str, value: Any) -> None:
     """Set a dotted name in a scenario's mapping; a number names an entry of a vector."""
     *groups, leaf = name.split(".")
     value = list(value) if isinstance(value, tuple) else value
@@ -157,7 +157,7 @@ def place(mapping: dict[str, Any], name: str, value: Any) -> None:
         target = _group(mapping, outer)
         entries = target.get(vector, _default(groups))
         if not isinstance(entries, list):
-            raise ConfigError("campaign", f"vary.{name}", f"{vector} is no vector")
+            raise ConfigError("campaign", f"vary.{name}", f"{vector} is not a vector")
         if int(leaf) >= len(entries):
             raise ConfigError("campaign", f"vary.{name}", f"{vector} has {len(entries)} entries")
         target[vector] = [*entries[:int(leaf)], value, *entries[int(leaf) + 1:]]
@@ -166,7 +166,7 @@ def place(mapping: dict[str, Any], name: str, value: Any) -> None:
 
 
 def _default(groups: list[str]) -> Any:
-    """What a scenario has where its mapping says nothing, vectors as lists."""
+    """The default of a scenario's value, vectors as lists."""
     value: Any = Scenario(name="defaults")
     for group in groups:
         value = getattr(value, group, None)
@@ -202,10 +202,10 @@ def _draw(vary: Mapping[str, Distribution], runs: int, seed: int) -> tuple[Run, 
         out.append(Run(number, int(values.pop("seed", drawn_seed)), values))
     different = len({(run.seed, json.dumps(run.values)) for run in out})
     if different < len(out):
-        raise ConfigError("campaign", "runs", f"only {different} of {len(out)} flights differ: ask for fewer, or do not vary `seed`")
+        raise ConfigError("campaign", "runs", f"only {different} of {len(out)} flights differ: fly fewer, or do not vary `seed`")
     return tuple(out)
 
 
-def in_words(values: Mapping[str, Any]) -> str:
-    """Varied values."""
+def values_text(values: Mapping[str, Any]) -> str:
+    """Varied values as text."""
     return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())

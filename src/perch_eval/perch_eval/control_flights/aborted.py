@@ -14,18 +14,18 @@ from perch_sim.scenario import load_scenario
 
 LIMIT = 60 * NANOSECONDS   # for the whole flight [ns]
 LINGER = NANOSECONDS // 2  # flown on after the goal's end [ns]
-AT_REST = 0.3              # speed of a hover [m/s]
+MAX_HOVER_SPEED = 0.3      # [m/s]
 
 
 @dataclass(frozen=True)
-class Aborted:
+class CancelledFlight:
     """One flight.
 
     Attributes:
         scenario, seed, before: what was flown, and when the goal was cancelled: time before the planned contact [s].
         planned: the vehicle left the plan by a planned way out.
         end: by the truth: never cancelled, broken (the vehicle has hit something), attached, hovering; or else the controller's state.
-        message: the mission's words.
+        message: of the mission.
         rate: largest body rate after the cancellation [rad/s].
         margin: least thrust margin of a rotor's command after it.
         distance: least distance of the centre of mass from the surface's plane after it [m]; of a wire's scenario meaningless.
@@ -44,15 +44,15 @@ class Aborted:
     settled: float
 
 
-def fly_aborted(scenario: str, seed: int, before: float) -> Aborted:
+def fly_cancelled(scenario: str, seed: int, before: float) -> CancelledFlight:
     """Fly a scenario, and cancel its goal `before` seconds ahead of the planned contact.
 
     Raises:
         PerchError: the scenario is refused.
     """
-    what = load_scenario(scenario)
-    loop = arrange(what, seed, Sensing())
-    goal = loop.send("mission", goal_of(what))
+    loaded = load_scenario(scenario)
+    loop = arrange(loaded, seed, Sensing())
+    goal = loop.send("mission", goal_of(loaded))
     stamp, cancelled, ended = 0, 0, 0
     rate, distance = 0.0, np.inf
     while stamp < LIMIT and not (ended and stamp - ended > LINGER):
@@ -70,9 +70,10 @@ def fly_aborted(scenario: str, seed: int, before: float) -> Aborted:
     statuses: list[ControllerStatus] = [s for s in loop.trace.values("controller/status") if s.stamp >= cancelled]
     loop.close()
     state = State(statuses[-1].state)
-    hovering = state is State.HOVERING and float(np.linalg.norm(simulation.state.v_WB)) < AT_REST
+    hovering = state is State.HOVERING and float(np.linalg.norm(simulation.state.v_WB)) < MAX_HOVER_SPEED
     held = simulation.plant.contact.attached or simulation.plant.cables.hold.active
     end = ("never cancelled" if not cancelled else "broken" if simulation.plant.crashed else "attached" if held else
            "hovering" if hovering else state.name.lower())
-    return Aborted(scenario, seed, before, any("as planned" in s.message for s in statuses), end, goal.result.message if goal.result else "no end",
-                   rate, min(s.thrust_margin for s in statuses), distance, seconds(max(ended, cancelled) - cancelled))
+    return CancelledFlight(scenario, seed, before, any("as planned" in s.message for s in statuses), end,
+                           goal.result.message if goal.result else "no end", rate, min(s.thrust_margin for s in statuses), distance,
+                           seconds(max(ended, cancelled) - cancelled))

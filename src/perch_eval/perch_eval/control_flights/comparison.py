@@ -57,10 +57,10 @@ def fly(controller: str, condition: str, maneuver: str, seed: int) -> tuple[np.n
     flown = flight.loop.trace.flight
     # A vehicle that has touched the wall follows no reference.
     touched = min([t for t, c in flown.values("contact") if t > begin], default=np.inf)
-    wanted = flown.reference()
-    assert wanted is not None
-    during = (wanted.t >= begin) & (wanted.t <= min(end if maneuver == "perch" else np.inf, touched))
-    times, p = wanted.t[during], wanted.p[during]
+    reference = flown.reference()
+    assert reference is not None
+    during = (reference.t >= begin) & (reference.t <= min(end if maneuver == "perch" else np.inf, touched))
+    times, p = reference.t[during], reference.p[during]
     return np.sqrt(np.mean((p - flown.known_states("ground_truth/odometry").at(times).p) ** 2, axis=0)), _outcome(flight, maneuver)
 
 

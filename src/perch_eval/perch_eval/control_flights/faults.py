@@ -22,15 +22,15 @@ from perch_sim import seeding
 from perch_sim.contact_event import ContactState
 
 SCENARIO = "surface_90"
-SILENCE_TIME = 3.0   # `flight.silence_time` in these flights [s]: its 60 s are a long wait to simulate
-PAUSE = 0.5          # hover before the perch [s]
-SETTLE = 4.0         # a hover that lasts so long is an end [s]
-LIMIT = 25.0         # after the fault a flight is judged as it is [s]
+SILENCE_TIME = 3.0   # `flight.silence_time` in these flights [s], as its 60 s take long to simulate
+HOVER_TIME = 0.5     # before the perch [s]
+SETTLING_TIME = 4.0  # a hover that lasts so long is an end [s]
+TIME_LIMIT = 25.0    # after the fault a flight is judged as it is [s]
 END_STATES = ("hovering", "landed", "perched")
 """What counts as a way out."""
 
 
-Strike = Callable[[ScriptedFlight, np.random.Generator], str]
+Injector = Callable[[ScriptedFlight, np.random.Generator], str]
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ class Fault:
     """
 
     name: str
-    about: str
-    strike: Strike
+    description: str
+    inject: Injector
     scenario: dict = field(default_factory=dict)
 
 
-def _stale(flight: ScriptedFlight, rng: np.random.Generator) -> str:
+def _stop_or_repeat_odometry(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     if rng.random() < 0.5:
         flight.loop.filters["controller", "odometry"] = lambda now, state: None
         return "no odometry any more"
@@ -59,35 +59,35 @@ def _stale(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     return "the last sample again and again"
 
 
-def _jump(flight: ScriptedFlight, rng: np.random.Generator) -> str:
+def _shift_position(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     offset = rng.normal(size=3)
     offset *= rng.uniform(0.3, 2.0) / np.linalg.norm(offset)
-    lasting = rng.uniform(0.01, 1.0) if rng.random() < 0.5 else np.inf
-    end = flight.time + lasting
+    duration = rng.uniform(0.01, 1.0) if rng.random() < 0.5 else np.inf
+    end = flight.time + duration
 
     def jumped(now: int, state: OdometryState) -> OdometryState:
         return state if seconds(now) > end else state._replace(p_WB=tuple((np.array(state.p_WB) + offset).tolist()))
 
     flight.loop.filters["controller", "odometry"] = jumped
-    return f"position jumps by ({offset[0]:.2f}, {offset[1]:.2f}, {offset[2]:.2f}) m" + (f" for {lasting:.2f} s" if np.isfinite(lasting) else " for good")
+    return f"position jumps by ({offset[0]:.2f}, {offset[1]:.2f}, {offset[2]:.2f}) m" + (f" for {duration:.2f} s" if np.isfinite(duration) else " for good")
 
 
-def _lose_vio(flight: ScriptedFlight, rng: np.random.Generator) -> str:
+def _stop_vio(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     for channel in ("vio/state", "vio/odometry"):
         flight.loop.filters["estimator", channel] = lambda now, value: None
     return "no VIO pose any more"
 
 
-def _lose_orders(flight: ScriptedFlight) -> None:
+def _drop_trajectories(flight: ScriptedFlight) -> None:
     flight.loop.filters["controller", "trajectory"] = lambda now, order: None
 
 
-def _silence(flight: ScriptedFlight, rng: np.random.Generator) -> str:
-    _lose_orders(flight)
+def _stop_trajectories(flight: ScriptedFlight, rng: np.random.Generator) -> str:
+    _drop_trajectories(flight)
     return "no trajectory any more"
 
 
-def _kick(flight: ScriptedFlight, rng: np.random.Generator) -> str:
+def _add_body_rate(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     axis = rng.normal(size=3) * (1.0, 1.0, 0.3)
     w = axis / np.linalg.norm(axis) * rng.uniform(8.0, 20.0)
     x, plant = flight.simulation.state, flight.simulation.plant
@@ -95,7 +95,7 @@ def _kick(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     return f"a blow turns the vehicle with ({w[0]:.1f}, {w[1]:.1f}, {w[2]:.1f}) rad/s"
 
 
-def _weaken(flight: ScriptedFlight, rng: np.random.Generator) -> str:
+def _weaken_rotors(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     vehicle, plant = flight.simulation.vehicle, flight.simulation.plant
     hover = vehicle.mass * 9.81 / (4.0 * vehicle.thrust_max)
     share = rng.uniform(0.95, 1.3) * hover
@@ -103,7 +103,7 @@ def _weaken(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     return f"all rotors give at most {100 * share / hover:.0f} % of the weight"
 
 
-def _fence(flight: ScriptedFlight, rng: np.random.Generator) -> str:
+def _move_fence(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     parameters = flight.controller.config
     limits, axis = parameters.flight, rng.integers(3)
     low, high = np.array(limits.fence_low), np.array(limits.fence_high)
@@ -116,12 +116,12 @@ def _fence(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     return f"the fence stands {abs(outside):.2f} m {'behind' if outside > 0 else 'ahead of'} the vehicle along {'xyz'[axis]}"
 
 
-def _nothing(flight: ScriptedFlight, rng: np.random.Generator) -> str:
+def _missed_contact(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     return "the velcro does not hold"
 
 
 def _abort(flight: ScriptedFlight, rng: np.random.Generator) -> str:
-    _lose_orders(flight)
+    _drop_trajectories(flight)
     if rng.random() < 0.5:
         flight.loop.request("controller", "abort", TriggerRequest())
         return "abort"
@@ -130,14 +130,14 @@ def _abort(flight: ScriptedFlight, rng: np.random.Generator) -> str:
 
 
 FAULTS = (
-    Fault("stale odometry", "odometry stops, or repeats its last sample", _stale),
-    Fault("jumping odometry", "the position jumps by 0.3 to 2 m, for up to 1 s or for good", _jump),
-    Fault("lost VIO", "no VIO pose reaches the estimator any more", _lose_vio),
-    Fault("planner silence", f"no trajectory comes any more; `flight.silence_time` {SILENCE_TIME:g} s instead of 60 s", _silence),
-    Fault("excess tilt, rate", "a blow adds 8 to 20 rad/s about a random axis", _kick),
-    Fault("low thrust margin", "all rotors weaken: the greatest thrust falls to 95 to 130 % of the weight", _weaken),
-    Fault("geofence", "the fence is moved to between 0.3 m ahead of and 1.5 m behind the vehicle", _fence),
-    Fault("missed contact", "the velcro does not hold", _nothing, {"adhesion": {"enabled": False}}),
+    Fault("stale odometry", "odometry stops, or repeats its last sample", _stop_or_repeat_odometry),
+    Fault("jumping odometry", "the position jumps by 0.3 to 2 m, for up to 1 s or for good", _shift_position),
+    Fault("lost VIO", "no VIO pose reaches the estimator any more", _stop_vio),
+    Fault("planner silence", f"no trajectory comes any more; `flight.silence_time` {SILENCE_TIME:g} s instead of 60 s", _stop_trajectories),
+    Fault("excess tilt, rate", "a blow adds 8 to 20 rad/s about a random axis", _add_body_rate),
+    Fault("low thrust margin", "all rotors weaken: the greatest thrust falls to 95 to 130 % of the weight", _weaken_rotors),
+    Fault("geofence", "the fence is moved to between 0.3 m ahead of and 1.5 m behind the vehicle", _move_fence),
+    Fault("missed contact", "the velcro does not hold", _missed_contact, {"adhesion": {"enabled": False}}),
     Fault("abort", "`abort`, or the goal is cancelled (HOVER)", _abort),
 )
 
@@ -150,11 +150,11 @@ class Ending:
         fault, seed: which flight.
         time: of the fault, since the order to take off [s]; phase: state of the controller then.
         done: what the fault was.
-        before: true height of the centre of mass [m], distance from the wall [m], speed [m/s], tilt [deg] when it struck.
+        before: true height of the centre of mass [m], distance from the wall [m], speed [m/s], tilt [deg] at the fault.
         end: hovering, landed, perched, crashed or lost.
         touched: surfaces hit by other parts than the plate without breaking anything.
         events: of the controller from the fault on.
-        search: of a flight without a good end: what rotors at their limits could still have done when the fault struck.
+        search: of a flight without a good end: what rotors at their limits could still have done at the time of the fault.
     """
 
     fault: str
@@ -182,55 +182,55 @@ def fly_fault(fault: Fault, seed: int) -> Ending:
     flight.arm()
     begin, height = flight.time + 0.2, flight.scenario.mission.takeoff_height
     rise = max(1.0, height / TAKE_OFF_SPEED)
-    ready = begin + LEAD + rise + PAUSE
+    ready = begin + LEAD + rise + HOVER_TIME
     place = flight.mission.p_WB + (0.0, 0.0, height)
     contact = ready + 2.0 * LEAD + flight.perch_plan(place, begin, np.zeros(3)).duration
     moment = rng.uniform(begin, contact)
 
     def perch() -> None:
-        with contextlib.suppress(PerchError):  # there is no plan from where the vehicle believes to be: the mission gives up, it hovers
+        with contextlib.suppress(PerchError):  # there is no plan from the estimated position: the mission gives up, the vehicle hovers
             flight.perch(place)
 
     script = [(begin, lambda: flight.mission.move(np.array([0.0, 0.0, height]), rise)), (ready, perch)]
-    struck, done, phase, before, first = False, "", "", (0.0,) * 4, 0
-    resting = flight.time
-    while flight.time < moment + LIMIT and not flight.simulation.plant.crashed:
+    injected, done, phase, before, first = False, "", "", (0.0,) * 4, 0
+    hovering_since = flight.time
+    while flight.time < moment + TIME_LIMIT and not flight.simulation.plant.crashed:
         while script and flight.time >= script[0][0]:
             script.pop(0)[1]()
-        if not struck and flight.time >= moment:
-            struck, phase, before, first = True, flight.state.name, _situation(flight), len(flight.events)
-            done = fault.strike(flight, rng)
+        if not injected and flight.time >= moment:
+            injected, phase, before, first = True, flight.state.name, _true_state(flight), len(flight.events)
+            done = fault.inject(flight, rng)
             plant = copy.deepcopy(flight.simulation.plant)
         flight.step()
         if flight.state is not State.HOVERING:
-            resting = flight.time
-        if struck and flight.state in (State.RECOVERING, State.LANDING, State.FAILED):
+            hovering_since = flight.time
+        if injected and flight.state in (State.RECOVERING, State.LANDING, State.FAILED):
             script.clear()  # the mission gives up
         off = flight.state in (State.DISARMED, State.FAILED, State.ATTACHED)
-        if struck and not script and (flight.time - resting > SETTLE or off and flight.time > moment + 1.0):
+        if injected and not script and (flight.time - hovering_since > SETTLING_TIME or off and flight.time > moment + 1.0):
             break
     if flight.state in (State.DISARMED, State.FAILED, State.ATTACHED):
-        flight.run(flight.time + 1.0)  # what has come off falls within this
+        flight.run(flight.time + 1.0)  # a vehicle that has come off falls within this time
     touched = tuple(sorted({f"{c.body} {c.normal_speed:.1f} m/s" for c in flight.loop.trace.contacts if c.state == ContactState.COLLISION}))
     end = _end(flight)
     return Ending(fault.name, seed, moment - begin, phase, done, before, end, touched,
                   tuple(f"{t - begin:.2f} s {state}: {text}" for t, state, text in flight.events[first:]),
-                  None if end in END_STATES or not struck else search(plant))
+                  None if end in END_STATES or not injected else search(plant))
 
 
-def _situation(flight: ScriptedFlight) -> tuple[float, float, float, float]:
+def _true_state(flight: ScriptedFlight) -> tuple[float, float, float, float]:
     x, pad = flight.simulation.state, flight.simulation.pad
     return (float(x.p_WB[2]), float((x.p_WB - pad.p_WS) @ pad.normal), float(np.linalg.norm(x.v_WB)), float(tilt_degrees(x.q_WB)))
 
 
 def _end(flight: ScriptedFlight) -> str:
-    """The end by the truth; the controller's word counts for a hover alone."""
+    """The end by the truth; only a hover depends on the controller's state."""
     plant, x = flight.simulation.plant, flight.simulation.state
     if plant.crashed:
         return "crashed"
     if plant.contact.attached:
         return "perched"
-    tilt = _situation(flight)[3]
+    tilt = _true_state(flight)[3]
     if x.p_WB[2] < flight.simulation.vehicle.perch_offset + 0.02 and tilt < 20.0 and np.linalg.norm(x.v_WB) < 0.1:
         return "landed"
     if flight.state is State.HOVERING and np.linalg.norm(x.v_WB) < 0.5 and tilt < 20.0:

@@ -1,8 +1,8 @@
 """Did physics leave a way out? All extreme rotor commands, tried on the plant itself from the moment of a fault.
 
 Rotor thrusts act on tilt and height almost linearly over the tenth of a second that a vehicle near the floor has, so that what can be
-reached is bounded by commands at the rotors' limits. The search knows the true state, has no delay and no law: it asks more than any
-controller could do.
+reached is bounded by commands at the rotors' limits. The search knows the true state, has no delay and no law: it is an upper
+bound of any controller.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ EXAMPLES = """examples:
                                                     p_cable, c_faults, c_comparison, c_way_out, c_contact, c_consistency)
 
 exit code: 0 every claim holds and every row is there, 1 a claim fails, 3 no claim fails but rows are not available,
-2 the caller's mistake, 130 interrupted"""
+2 invalid input, 130 interrupted"""
 
 
 PARTS = {

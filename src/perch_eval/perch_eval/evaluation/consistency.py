@@ -1,6 +1,6 @@
 """Consistency of VIO, estimator and target over Monte-Carlo runs of rendered perches: NEES and NIS with their bounds.
 
-Judged in the air: on the ground the vehicle stands exactly where it was told, and no covariance of use is as small as that.
+Judged in the air: on the ground the vehicle stands exactly at its given position, and no covariance of use is as small as that.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from perch_sim.scenario import load_scenario
 
 SCENARIO = "surface_90"
 STATES = "estimator: all 15 states"
-BAR = 0.85  # of the time inside the bounds
+REQUIRED_SHARE = 0.85  # of the time inside the bounds
 GROUPS = {STATES: slice(0, 15), "estimator: position": slice(0, 3), "estimator: velocity": slice(3, 6),
           "estimator: attitude": slice(6, 9)}
 TARGET_GROUPS = {"target: pose": slice(0, 6), "target: position": slice(0, 3), "target: attitude": slice(3, 6)}
 AIRBORNE_AFTER = 0.4  # from the first thrust until the vehicle is clear of the ground [s]
-LOOK = (-1.5, 0.4)    # the pad is looked at from the hover until it leaves the view, relative to the perch's begin [s]
+SIGHTING_WINDOW = (-1.5, 0.4)  # of images of the pad: from the hover until it leaves the view, relative to the perch's begin [s]
 
 
 @dataclass(frozen=True)
 class _Run:
-    """One flight: the estimator along it, VIO's NEES at its poses, the pad as it was seen."""
+    """One flight: the estimator along it, VIO's NEES at its poses, the sightings of the pad."""
 
     track: EstimatorTrack
     vio_times: np.ndarray
@@ -46,7 +46,7 @@ def consistency_sections(effort: Effort) -> list[Section]:
     out = Section("c_consistency", "Consistency of the estimators",
                   f"`{SCENARIO}` with cameras rendered and calibration errors drawn, seeds {effort.seeds.start} to {effort.seeds.stop - 1}; a motion that "
                   "is the same in every run, VIO's start parameters wrong as declared (1 mm, 1 mrad). NEES per dimension, averaged over the flight; the "
-                  "share of the time in which the mean over the runs is inside its 95 % bounds, and above them (too sure).")
+                  "share of the time in which the mean over the runs is inside its 95 % bounds, and above them (overconfident).")
     motion = flights.motion_of(load_scenario(SCENARIO), effort.seeds.start)  # its phases are those of every run
     found = dict(with_progress(in_processes(_fly, list(effort.seeds), effort.jobs), len(effort.seeds), unit="perches"))
     flown = [found[seed] for seed in effort.seeds]
@@ -60,7 +60,7 @@ def consistency_sections(effort: Effort) -> list[Section]:
     for r in results:
         words = f"{r.mean.mean() / r.dimension:.2f}; {100 * r.inside:.0f} % inside, {100 * r.above:.0f} % above"
         if r.name == STATES:
-            out.claim(r.name, words, "", r.inside >= BAR, f"inside for at least {100 * BAR:.0f} % of the time")
+            out.claim(r.name, words, "", r.inside >= REQUIRED_SHARE, f"inside for at least {100 * REQUIRED_SHARE:.0f} % of the time")
         else:
             out.show(r.name, words)
         out.data[r.name] = {"inside": r.inside, "above": r.above, "mean_over_dimension": float(r.mean.mean() / r.dimension), "bounds": r.bounds}
@@ -85,7 +85,7 @@ def _fly(seed: int) -> _Run:
     nees = [consistency.nees(s.error[:6], s.result.estimate.pose_covariance) for s in posed if s.error is not None and s.result.estimate is not None]
     return _Run(track, np.array([s.time for s in posed]), np.array(nees),
                 sum(s.result.nis for s in seen) / sum(s.result.nis_dimension for s in seen),
-                localize_target(scenario, flight, track, seed, motion.perch_time + LOOK[0], motion.perch_time + LOOK[1]))
+                localize_target(scenario, flight, track, seed, motion.perch_time + SIGHTING_WINDOW[0], motion.perch_time + SIGHTING_WINDOW[1]))
 
 
 def _judged(groups: dict[str, slice], times: np.ndarray, errors: list[np.ndarray], covariances: list[np.ndarray]) -> list[Consistency]:

@@ -19,10 +19,10 @@ from perch_eval.evaluation.sections import Effort, Section
 
 MOMENTS = 20                         # of each fault
 QUICK_SEEDS, FULL_SEEDS = 1, 5       # of the comparison
-WORST = 0.05                         # RMSE of each axis of a perch [m]
-CUT = 0.6                            # share of the RMSE that L1 takes away
+MAX_RMSE = 0.05                      # of each axis of a perch [m]
+REQUIRED_REDUCTION = 0.6             # share of the RMSE that L1 must remove
 LOADED = "wind 5 m/s, mass +20 %"
-NO_WAY = "no way out"
+NO_WAY_OUT = "no way out"
 GOOD = ("held", "perched")
 ENDINGS = ("hovering", "landed", "perched", "crashed", "lost")
 
@@ -30,7 +30,7 @@ ENDINGS = ("hovering", "landed", "perched", "crashed", "lost")
 def fault_sections(effort: Effort) -> list[Section]:
     """Every fault at random moments; writes `faults_in_flight.md` and its JSON."""
     jobs = [(fault.name, seed) for fault in FAULTS for seed in range(1, MOMENTS + 1)]
-    flown = cached_figures(effort, "faults", jobs, _faulted, lambda r: r["end"] in END_STATES)
+    flown = cached_figures(effort, "faults", jobs, _fly_with_fault, lambda r: r["end"] in END_STATES)
     about = (f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
              "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth.")
     out = Section("c_faults", "Faults in flight", f"{about} Flights without a good end: faults_in_flight.md.")
@@ -40,15 +40,15 @@ def fault_sections(effort: Effort) -> list[Section]:
         ends, touched = Counter(r["end"] for r in own), sum(bool(r["touched"]) and r["end"] in END_STATES for r in own)
         safe = sum(ends[e] for e in END_STATES)
         without = sum(_no_way_out(r) for r in own)
-        rows.append((f"{fault.name}: {fault.about}", *(ends[e] for e in ENDINGS), without, touched))
-        out.claim(fault.name, f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]) + f"; {without} {NO_WAY}" * bool(without),
-                  "", safe + without == len(own) if own else None, "every flight ends hovering, landed or perched, or had no way out")
+        rows.append((f"{fault.name}: {fault.description}", *(ends[e] for e in ENDINGS), without, touched))
+        found = f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]) + f"; {without} {NO_WAY_OUT}" * bool(without)
+        out.claim(fault.name, found, "", safe + without == len(own) if own else None, "every flight ends hovering, landed or perched, or had no way out")
     text = ["# Faults in flight", "", f"{about} Every flight: faults_in_flight.json.", "",
             "*crashed*: broken by an impact, or a rotor touched the floor; *lost*: none of the others after 25 s; *touched the wall*: rotors touched "
-            f"it on the way, and nothing broke; *{NO_WAY}*: from the true state in which the fault left the vehicle, without any delay, rotors at their "
-            "limits in any combination, changed to any other once, were tried on the plant, and all of them broke it.", "",
-            *table(" | ".join(("fault", *ENDINGS, f"of these {NO_WAY}", "touched the wall")), rows), "",
-            "## Flights without a good end", "", *([_told(r) for r in flown if r["end"] not in END_STATES] or ["None."])]
+            f"it on the way, and nothing broke; *{NO_WAY_OUT}*: from the true state in which the fault left the vehicle, without any delay, rotors at "
+            "their limits in any combination, changed to any other once, were tried on the plant, and all of them broke it.", "",
+            *table(" | ".join(("fault", *ENDINGS, f"of these {NO_WAY_OUT}", "touched the wall")), rows), "",
+            "## Flights without a good end", "", *([_description(r) for r in flown if r["end"] not in END_STATES] or ["None."])]
     write_page(effort, "faults_in_flight", text, {"flights": flown})
     out.data = {"flights": flown}
     return [out]
@@ -58,7 +58,7 @@ def comparison_sections(effort: Effort) -> list[Section]:
     """All controllers on the same flights; writes `comparison.md` and `comparison.json`."""
     seeds = range(1, 1 + (FULL_SEEDS if effort.full else QUICK_SEEDS))
     jobs = [(c, k, m, seed) for seed in seeds for m in MANEUVERS for k in CONDITIONS for c in CONTROLLERS]
-    flown = cached_figures(effort, "comparison", jobs, _compared, lambda r: r["outcome"] in GOOD)
+    flown = cached_figures(effort, "comparison", jobs, _fly_comparison, lambda r: r["outcome"] in GOOD)
     runs = {key: [r for r in flown if (r["controller"], r["condition"], r["maneuver"]) == key] for key in product(CONTROLLERS, CONDITIONS, MANEUVERS)}
     offset = ", ".join(f"{x:g}" for x in LINE)
     about = (f"{'Seed 1' if len(seeds) == 1 else f'Seeds 1 to {len(seeds)}'}; true position against the reference "
@@ -77,12 +77,12 @@ def comparison_sections(effort: Effort) -> list[Section]:
         own = runs[c, "nominal", "perch"]
         worst = float(_rms(own).max())
         out.claim(f"{c}: perch, nominal, worst axis", f"{100 * worst:.1f} cm", "5 to 10.8 cm",
-                  worst <= WORST and all(r["outcome"] == "perched" for r in own), f"at most {100 * WORST:g} cm; all perched")
+                  worst <= MAX_RMSE and all(r["outcome"] == "perched" for r in own), f"at most {100 * MAX_RMSE:g} cm; all perched")
     for law in ("geometric", "nmpc"):
         plain, adaptive = (float(np.linalg.norm(_rms(runs[c, LOADED, "line"]))) for c in (law, f"{law} + L1"))
-        whole = all(r["outcome"] == "held" for r in runs[f"{law} + L1", LOADED, "line"])
+        all_held = all(r["outcome"] == "held" for r in runs[f"{law} + L1", LOADED, "line"])
         out.claim(f"{law}: line, {LOADED}, with L1", f"{100 * plain:.1f} -> {100 * adaptive:.1f} cm, {100 * (1 - adaptive / plain):.0f} % less", "",
-                  adaptive <= (1 - CUT) * plain and whole, f"at least {100 * CUT:g} % less; with L1 all held")
+                  adaptive <= (1 - REQUIRED_REDUCTION) * plain and all_held, f"at least {100 * REQUIRED_REDUCTION:g} % less; with L1 all held")
     for c in CONTROLLERS:
         own = [r for r in flown if r["controller"] == c and r["maneuver"] == "perch"]
         out.show(f"{c}: perches that hold, all conditions", f"{sum(r['outcome'] == 'perched' for r in own)}/{len(own)}")
@@ -95,15 +95,15 @@ def _no_way_out(r: dict[str, Any]) -> bool:
     return r["search"] is not None and r["search"]["survived"] == 0
 
 
-def _told(r: dict[str, Any]) -> str:
+def _description(r: dict[str, Any]) -> str:
     """A flight without a good end."""
     height, gap, speed, tilt = r["before"]
     return (f"* **{r['fault']}**, seed {r['seed']}, {r['time']:.2f} s after the order to take off ({r['phase'].lower()}): {r['done']}. Then "
             f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg. "
-            f"End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. {_searched(r)}{' / '.join(r['events'])}")
+            f"End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. {_search_text(r)}{' / '.join(r['events'])}")
 
 
-def _searched(r: dict[str, Any]) -> str:
+def _search_text(r: dict[str, Any]) -> str:
     x = r["search"]
     if x is None:
         return ""
@@ -124,11 +124,11 @@ def _cell(own: Sequence[dict[str, Any]]) -> str:
     return ", ".join(f"{x:.1f}" for x in 100 * _rms(own)) + "; " + (", ".join(f"{n} {end}" for end, n in ends.most_common()) if len(ends) > 1 else [*ends][0])
 
 
-def _faulted(job: tuple[str, int]) -> dict[str, Any]:
+def _fly_with_fault(job: tuple[str, int]) -> dict[str, Any]:
     return asdict(fly_fault(next(fault for fault in FAULTS if fault.name == job[0]), job[1]))
 
 
-def _compared(job: tuple[str, str, str, int]) -> dict[str, Any]:
+def _fly_comparison(job: tuple[str, str, str, int]) -> dict[str, Any]:
     controller, condition, maneuver, seed = job
     rmse, outcome = fly(*job)
     return {"controller": controller, "condition": condition, "maneuver": maneuver, "seed": seed, "rmse": rmse.tolist(), "outcome": outcome}

@@ -20,8 +20,9 @@ from perch_eval.rows import Rows, rows_of
 T = TypeVar("T")
 
 
-def cached_figures(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], dict[str, Any]], good: Callable[[dict[str, Any]], bool],
-             key: Callable[[T], str] = str, on_worker_death: Callable[[T], dict[str, Any]] | None = None) -> list[dict[str, Any]]:
+def cached_figures(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], dict[str, Any]],
+                   good: Callable[[dict[str, Any]], bool], key: Callable[[T], str] = str,
+                   on_worker_death: Callable[[T], dict[str, Any]] | None = None) -> list[dict[str, Any]]:
     """Figures of flights, a mapping each, in the order of the jobs.
 
     Args:
@@ -41,8 +42,8 @@ def cached_figures(effort: Effort, name: str, jobs: Sequence[T], work: Callable[
     known: dict[str, dict[str, Any]] = {} if effort.fresh else dict(rows_of(file))
     missing = [job for job in jobs if key(job) not in known]
     before = [known[key(job)] for job in jobs if key(job) in known]
-    found = with_progress(in_processes(work, missing, effort.jobs, on_worker_death), len(jobs), lambda one: good(one[1]), initial=len(before),
-                          initial_good=sum(map(good, before)), unit=name.replace("_", " "))
+    found = with_progress(in_processes(work, missing, effort.jobs, on_worker_death), len(jobs), lambda one: good(one[1]),
+                          initial=len(before), initial_good=sum(map(good, before)), unit=name.replace("_", " "))
     with closing(Rows(file, known.items())) as rows:
         for job, result in found:
             known[key(job)] = finite(result)
@@ -50,12 +51,13 @@ def cached_figures(effort: Effort, name: str, jobs: Sequence[T], work: Callable[
     return [known[key(job)] for job in jobs]
 
 
-def cached_runs(effort: Effort, name: str, tasks: Sequence[Task], good: Callable[[RunResult], bool] = lambda r: r.cause == SUCCESS) -> list[RunResult]:
+def cached_runs(effort: Effort, name: str, tasks: Sequence[Task],
+                good: Callable[[RunResult], bool] = lambda r: r.cause == SUCCESS) -> list[RunResult]:
     """Runs of a campaign's engine, which keep their numbers when others are added; arguments as those of `cached_figures`."""
-    found = cached_figures(effort, name, tasks, _carried_out, lambda row: good(RunResult(**row)), lambda task: str(task.run.number),
-                     lambda task: asdict(failed_run(task)))
+    found = cached_figures(effort, name, tasks, _run_task, lambda row: good(RunResult(**row)), lambda task: str(task.run.number),
+                           lambda task: asdict(failed_run(task)))
     return [RunResult(**row) for row in found]
 
 
-def _carried_out(task: Task) -> dict[str, Any]:
+def _run_task(task: Task) -> dict[str, Any]:
     return asdict(run_task(task))

@@ -32,7 +32,7 @@ AGGRESSIVE = "surface_90_aggressive"
 """Flown for the body rates of Fig. 6."""
 
 SUCCESSES = {"surface_60": 4, "surface_90": 4, "surface_60_far": 3, "surface_90_far": 4}  # of 5
-BARS = {"surface_60": 0.95, "surface_90": 0.95, "surface_60_far": 0.90, "surface_90_far": 0.90}  # with 100 seeds
+REQUIRED_RATES = {"surface_60": 0.95, "surface_90": 0.95, "surface_60_far": 0.90, "surface_90_far": 0.90}  # with 100 seeds
 # x, y, z [m]: (tracking, estimation)
 RMSE = {"surface_60": ((0.0500, 0.0325, 0.1509), (0.0145, 0.0851, 0.0714)),
         "surface_60_far": ((0.0378, 0.0732, 0.1321), (0.0401, 0.0714, 0.0452)),
@@ -56,18 +56,18 @@ def perches(effort: Effort) -> dict[str, list[RunResult]]:
     return {name: [r for r in found if r.values["scenario"] == name] for name in (*CONDITIONS, AGGRESSIVE)}
 
 
-def _words(name: str) -> str:
+def _condition_text(name: str) -> str:
     inclination, distance = CONDITIONS[name]
     return f"{inclination} deg, {distance:g} m"
 
 
-def _seeds(effort: Effort) -> str:
+def _seeds_text(effort: Effort) -> str:
     return f"seeds {effort.seeds.start} to {effort.seeds.stop - 1}"
 
 
 def _errors(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
     out = Section("m_table_2", "[M] Table II: tracking and estimation RMSE",
-                  f"Per axis over the perch, from its planned start to the contact; median [range] over {_seeds(effort)}, failed flights "
+                  f"Per axis over the perch, from its planned start to the contact; median [range] over {_seeds_text(effort)}, failed flights "
                   "included. Both cameras are rendered; VIO, UKF, tag localisation, planner and controller are those that fly.")
     for name, paper in RMSE.items():
         for kind, values in zip(("tracking", "estimation"), paper):
@@ -76,24 +76,25 @@ def _errors(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
                 errors = [r.metrics.get(f"{kind}_rmse_m_{axis}") for r in groups[name]]
                 spread = Spread.from_values(errors)
                 medians.append(spread.median)
-                out.compare(f"{_words(name)}: {kind} {axis}", spread.to_text(100, 1, "cm"), f"{100 * value:.2f} cm", spread.median <= value)
+                out.compare(f"{_condition_text(name)}: {kind} {axis}", spread.to_text(100, 1, "cm"), f"{100 * value:.2f} cm", spread.median <= value)
                 out.data[f"{name}_{kind}_{axis}"] = errors
             ours, theirs = math.hypot(*medians), math.hypot(*values)
-            out.claim(f"{_words(name)}: {kind}, all axes", f"{100 * ours:.1f} cm", f"{100 * theirs:.1f} cm", ours <= theirs,
+            out.claim(f"{_condition_text(name)}: {kind}, all axes", f"{100 * ours:.1f} cm", f"{100 * theirs:.1f} cm", ours <= theirs,
                       "root of the sum of squares is at most the paper's")
     return out
 
 
 def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
     out = Section("m_table_3", "[M] Table III: success rate",
-                  f"{_seeds(effort)}; a success: the vehicle is attached to the pad at the end, and the mission reports it. "
+                  f"{_seeds_text(effort)}; a success: the vehicle is attached to the pad at the end, and the mission reports it. "
                   "95 % Wilson intervals.")
     for name, paper in SUCCESSES.items():
         rate = Rate.from_outcomes(r.cause == SUCCESS for r in groups[name])
-        bar = BARS[name] if effort.full else paper / 5
+        bar = REQUIRED_RATES[name] if effort.full else paper / 5
         why = f"at least {100 * bar:.0f} %" + ("" if effort.full else ", the paper's rate")
         causes = ", ".join(f"seed {r.seed}: {r.cause}" for r in groups[name] if r.cause != SUCCESS)
-        out.claim(_words(name), str(rate), f"{paper}/5", rate.value >= bar if rate.trials else None, why + (f"; failed: {causes}" if causes else ""))
+        out.claim(_condition_text(name), str(rate), f"{paper}/5", rate.value >= bar if rate.trials else None,
+                  why + (f"; failed: {causes}" if causes else ""))
         out.data[name] = {"successes": rate.successes, "trials": rate.trials, "interval": rate.interval,
                           "failed": {str(r.seed): [r.cause, r.message] for r in groups[name] if r.cause != SUCCESS}}
     return out
@@ -102,7 +103,7 @@ def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
 def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section]:
     """Fig. 5 and 6 from the first seed at 90 deg, 1.7 m, with the figures of all seeds beside the paper's."""
     five = Section("m_fig_5", "[M] Fig. 5: tracking, localisation and thrust at 90 deg, 1.7 m", "Seed 1; truth, estimate and reference.")
-    six = Section("m_fig_6", "[M] Fig. 6: body rates at 90 deg, 1.7 m", f"The figure shows seed 1, the rows {_seeds(effort)}.")
+    six = Section("m_fig_6", "[M] Fig. 6: body rates at 90 deg, 1.7 m", f"The figure shows seed 1, the rows {_seeds_text(effort)}.")
     scenario = load_scenario("surface_90")
     trace = fly(scenario, 1, SENSING, linger=0.5)
     view = FlightView.from_flight(trace.flight, load_vehicle(scenario.vehicle))

@@ -63,14 +63,14 @@ def _table(effort: Effort, vehicle: Vehicle) -> Section:
         out.data[f"nonlinear_{waypoints}"] = [n.solve_time for n in nonlinear]
         done = sum(n.converged for n in nonlinear)
         out.show(f"nonlinear program (NLopt SLSQP), {waypoints} waypoints", times.to_text(1.0, 0, "ms"), f"{paper_nlp:g} ms",
-                 f"{done} of {len(nonlinear)} converged; durations are given to it, which the paper's had to find")
+                 f"{done} of {len(nonlinear)} converged; durations are given, which the paper's program had to find")
         ratio = times.median / qp.median
         out.claim(f"nonlinear / QP as printed, {waypoints} waypoints", f"{ratio:.1f} x", f"{paper_nlp / paper_qp:.0f} x", ratio >= 2.0,
                   "checking after the QP is at least twice as fast as enforcing the bound, though numpy calls are most of its time")
         ours = [found for p in problems if (found := _fastest(planner.plan, replace(p, segment_times=None), vehicle)) is not None]
         out.data[f"shipped_{waypoints}"] = [found.solve_time for found in ours]
         shipped = Spread.from_values(1e3 * found.solve_time for found in ours)
-        out.compare(f"what flies, {waypoints} waypoints", shipped.to_text(1.0, 2, "ms"), f"{paper_qp:g} ms", shipped.median <= paper_qp,
+        out.compare(f"shipped planner, {waypoints} waypoints", shipped.to_text(1.0, 2, "ms"), f"{paper_qp:g} ms", shipped.median <= paper_qp,
                     f"{len(ours)} of {count} planned, from its own first durations; every limit proved, single rotors too")
     return out
 
@@ -95,11 +95,12 @@ def _figure(effort: Effort, vehicle: Vehicle) -> Section:
     figure = Figure(figsize=(8.0, 3.6), layout="constrained")
     axes = figure.subplots()
     peaks = []
-    for k, tried in enumerate(found.iterations):
-        if tried.coefficients is None:
+    for k, iteration in enumerate(found.iterations):
+        if iteration.coefficients is None:
             continue
-        peaks.append(vehicle.mass * plan_checks.thrust_extrema(tried.coefficients, tried.program.durations, 0.0, bound / vehicle.mass)[2])
-        t, thrust = _thrust(tried.coefficients, tried.program.durations, vehicle.mass)
+        durations = iteration.program.durations
+        peaks.append(vehicle.mass * plan_checks.thrust_extrema(iteration.coefficients, durations, 0.0, bound / vehicle.mass)[2])
+        t, thrust = _thrust(iteration.coefficients, durations, vehicle.mass)
         axes.plot(t, thrust, lw=1.4, label=f"{k + 1}: {t[-1]:.2f} s, peak {peaks[-1]:.2f} N")
     axes.axhline(bound, color="k", lw=0.8, ls="--", label=f"bound {bound:g} N")
     axes.set(xlabel="time [s]", ylabel="thrust [N]", ylim=(0.0, min(1.05 * max(peaks), 6 * bound)))
@@ -113,7 +114,7 @@ def _figure(effort: Effort, vehicle: Vehicle) -> Section:
     out.claim("peak of the last iteration", f"{peaks[-1]:.3f} N", f"<= {bound:g} N", found.solved and peaks[-1] <= bound,
               "the bound is kept: proved by subdivision, not sampled")
     assert found.trajectory is not None
-    out.show("final duration", f"{found.trajectory.duration:.2f} s", "1.4 s", "the paper does not say where its start and target are")
+    out.show("final duration", f"{found.trajectory.duration:.2f} s", "1.4 s", "start and target are not given in the paper")
     return out
 
 

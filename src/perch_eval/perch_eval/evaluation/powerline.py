@@ -9,7 +9,7 @@ import numpy as np
 from perch_core.errors import PerchError, PlanningRefusal
 from perch_core.vehicle import load_vehicle
 from perch_eval.campaign.causes import SUCCESS
-from perch_eval.evaluation.powerline_flights import AROUND, SEEDS_WITHOUT_GRIP, flights, recovered
+from perch_eval.evaluation.powerline_flights import MAP_RADIUS, SEEDS_WITHOUT_GRIP, flights, recovered
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.statistics import Rate, Spread
 from perch_planner.powerline import problem
@@ -21,7 +21,7 @@ from perch_planner.powerline.visibility import visibility
 # case -> (position RMSE [cm], pitch-roll RMSE [deg], perch [ms], recovery [ms])
 TABLE = {"line_80": (3.1, 2.0, 432, 221), "line_80_pa": (3.4, 2.6, 1526, 584), "line_20": (2.7, 2.1, 457, 351),
          "line_20_pa": (4.8, 7.2, 1893, 461), "line_180": (6.9, 3.0, 532, 1214)}
-WORDS = {"line_80": "80 deg", "line_80_pa": "80 deg, perception-aware", "line_20": "20 deg", "line_20_pa": "20 deg, perception-aware",
+TITLES = {"line_80": "80 deg", "line_80_pa": "80 deg, perception-aware", "line_20": "20 deg", "line_20_pa": "20 deg, perception-aware",
          "line_180": "180 deg"}
 PUBLISHED = {"deg90_published": 1.861, "upside_down_published": 2.485}  # durations of the authors' own trajectories [s]
 
@@ -59,9 +59,9 @@ def _table(effort: Effort) -> Section:
         out.data[case] = {"perch_s": perch, "recovery_s": recovery, "refused": refused}
         for name, values, paper in (("perch", perch, paper_perch), ("recovery", recovery, paper_recovery)):
             spread = Spread.from_values(1e3 * v for v in values)
-            out.claim(f"{WORDS[case]}: {name}", spread.to_text(1.0, 0, "ms"), f"{paper} ms", spread.median <= paper,
+            out.claim(f"{TITLES[case]}: {name}", spread.to_text(1.0, 0, "ms"), f"{paper} ms", spread.median <= paper,
                       "median at most the paper's")
-        out.claim(f"{WORDS[case]}: starts solved, limits kept between nodes", f"{len(perch)}/{count}, {violated} violations",
+        out.claim(f"{TITLES[case]}: starts solved, limits kept between nodes", f"{len(perch)}/{count}, {violated} violations",
                   "", len(perch) == count and violated == 0, "; ".join(refused) or "all, none")
     return out
 
@@ -75,12 +75,12 @@ def flown_sections(effort: Effort) -> list[Section]:
                   f"{flown}; when the gripper closes, or where it should have. Position: RMSE across the wire, of "
                   "the body's true place against the true wire from its planned place against the planned one; in map: against the plan in map, "
                   "with the odometry's drift, which moves plan and wire together. Mapping: mean distance of the mapped wire from the true one "
-                  f"within {AROUND:g} m of the target point when the perch is planned, as the vehicle sees both (in map: with the drift). "
+                  f"within {MAP_RADIUS:g} m of the target point when the perch is planned, both relative to the vehicle (in map: with the drift). "
                   f"Some scenarios are flown with the grip switched off as well (seeds up to {min(SEEDS_WITHOUT_GRIP, seeds[-1])}): each ends in a recovery. "
                   "The paper: an optical tracking system instead of VIO and mapping, no gripper, 5 flights each.")
     found = flights(effort, tuple(TABLE))
     for case, (paper_p, paper_q, *_) in TABLE.items():
-        runs, name = found[case, True], WORDS[case]
+        runs, name = found[case, True], TITLES[case]
         missed = [r for r in runs if r.cause != SUCCESS]
         words = "; ".join(f"seed {r.seed}: {r.cause}: {r.message}" for r in missed)
         out.show(f"{name}: gripped the cable", str(Rate.from_outcomes(r.cause == SUCCESS for r in runs)), "", words)
@@ -100,14 +100,15 @@ def flown_sections(effort: Effort) -> list[Section]:
         out.claim(f"{name}: mapping", f"{error:.1f} cm ({len(mapped)} maps)", "", error <= 3.0 if mapped else None, "at most 3 cm in the mean")
         hovering = sum(map(recovered, missed))
         out.claim(f"{name}: recoveries to a hover", f"{hovering} of {len(missed)}", "", hovering == len(missed) if missed else None, "all that did not grip")
-        let_go = found[case, False]
-        if let_go:
-            words = "; ".join(f"seed {r.seed}: {r.cause}: {r.message}" for r in let_go if not recovered(r))
-            out.claim(f"{name}, grip switched off: recoveries to a hover", f"{sum(map(recovered, let_go))} of {len(let_go)}", "", not words, words or "all")
-        others = int(sum(r.metrics.get("other_lines_touched") or 0.0 for r in runs + let_go))
+        without_grip = found[case, False]
+        if without_grip:
+            words = "; ".join(f"seed {r.seed}: {r.cause}: {r.message}" for r in without_grip if not recovered(r))
+            out.claim(f"{name}, grip switched off: recoveries to a hover", f"{sum(map(recovered, without_grip))} of {len(without_grip)}", "",
+                      not words, words or "all")
+        others = int(sum(r.metrics.get("other_lines_touched") or 0.0 for r in runs + without_grip))
         out.claim(f"{name}: contacts with other lines", f"{others}", "", others == 0, "none")
         out.data[case] = [{"seed": r.seed, "grips": r.values["grips"], "cause": r.cause, "outcome": r.outcome, "message": r.message, **r.metrics}
-                          for r in runs + let_go]
+                          for r in runs + without_grip]
     return [out]
 
 
@@ -137,14 +138,14 @@ def _pictures(effort: Effort) -> list[Section]:
         planned = problem.plan(problem.load(f"powerline_{case}"))
         assert planned.plan.perch is not None
         draw_manoeuvre(planned, effort.out / f"p_{case}.png")
-        section.figures.append((f"p_{case}.png", f"{WORDS[case]}: the manoeuvre"))
+        section.figures.append((f"p_{case}.png", f"{TITLES[case]}: the manoeuvre"))
         if section is seven:
             draw_visibility(planned, effort.out / f"p_{case}_visibility.png")
-            section.figures.append((f"p_{case}_visibility.png", f"{WORDS[case]}: reprojection error and visibility"))
+            section.figures.append((f"p_{case}_visibility.png", f"{TITLES[case]}: reprojection error and visibility"))
             mount = planned.vehicle.mounts[planned.problem.settings.camera]
-            seen = visibility(planned.plan.perch.states, planned.request.target(), mount)
-            means[case] = seen.summary()
-            section.show(f"{WORDS[case]}: mean reprojection error, line at the centre", f"{means[case]['mean_reprojection_px']:.0f} px, "
+            measures = visibility(planned.plan.perch.states, planned.request.target(), mount)
+            means[case] = measures.summary()
+            section.show(f"{TITLES[case]}: mean reprojection error, line at the centre", f"{means[case]['mean_reprojection_px']:.0f} px, "
                          f"{100 * means[case]['segment_share']:.0f} % of the time")
         else:
             low = next(b for b in planned.plan.bounds if b.quantity == "height")

@@ -27,9 +27,9 @@ from perch_sim.scenario import Scenario
 
 ENGINE = "perch_eval.evaluation.powerline_flights:fly_line"
 RENDERED = Sensing(vio="rendered", target="rendered")
-WITHOUT_GRIP = ("line_80", "line_20", "line_180")  # are flown with a gripper that never closes, too: all must recover
+CASES_WITHOUT_GRIP = ("line_80", "line_20", "line_180")  # also flown with a gripper that never closes: all must recover
 SEEDS_WITHOUT_GRIP = 3
-AROUND = 1.5  # the map is judged within this of the target point [m]
+MAP_RADIUS = 1.5  # around the target point within which the map is judged [m]
 
 
 def fly_line(task: Task) -> RunResult:
@@ -43,7 +43,7 @@ def _errors(flight: Flight, scenario: Scenario, vehicle: Vehicle) -> dict[str, f
 
 
 def _target(scenario: Scenario) -> int:
-    """Index of the cable that the goal means."""
+    """Index of the cable that is the goal."""
     point = np.array(scenario.mission.perch_point)
     return int(np.argmin([CableLine(cable).nearest(point).distance for cable in scenario.world.cables]))
 
@@ -87,23 +87,23 @@ def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> d
     moment = touch[0] if touch is not None and plan.start_time < touch[0] < end else end
     if truth.t[-1] < moment:
         return none
-    wanted, last, true = plan.sample(moment - plan.start_time), plan.sample(perch_time), truth.at(np.array([moment]))
-    b3 = so3.quat_to_matrix(wanted.q)[:, 2]
+    planned, last, true = plan.sample(moment - plan.start_time), plan.sample(perch_time), truth.at(np.array([moment]))
+    b3 = so3.quat_to_matrix(planned.q)[:, 2]
     planned_wire = last.p - wire_offset * so3.quat_to_matrix(last.q)[:, 2]
     wire = CableLine(scenario.world.cables[_target(scenario)]).nearest(true.p[0])
-    apart = (true.p[0] - wire.point_W) - (wanted.p - planned_wire)
-    apart -= (apart @ wire.direction) * wire.direction
+    offset = (true.p[0] - wire.point_W) - (planned.p - planned_wire)
+    offset -= (offset @ wire.direction) * wire.direction
     tilt = so3.angle_between(b3, so3.quat_to_matrix(true.q[0])[:, 2])
-    return {"perching_position_m": float(np.linalg.norm(apart)), "perching_in_map_m": float(np.linalg.norm(true.p[0] - wanted.p)),
+    return {"perching_position_m": float(np.linalg.norm(offset)), "perching_in_map_m": float(np.linalg.norm(true.p[0] - planned.p)),
             "perching_tilt_deg": math.degrees(tilt)}
 
 
 def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None]:
-    """Mean distance of the mapped target wire from the true one within `AROUND` of the target point, when the first plan is flown.
+    """Mean distance of the mapped target wire from the true one within `MAP_RADIUS` of the target point, when the first plan is flown.
 
     Returns:
-        `mapping_in_map_m`: of both in map, odometry's drift included; `mapping_m`: as the vehicle sees them, the mapped one from
-        its estimated pose and the true one from its true pose.
+        `mapping_in_map_m`: of both in map, odometry's drift included; `mapping_m`: relative to the vehicle, the mapped one to
+        its estimated pose and the true one to its true pose.
     """
     none: dict[str, float | None] = {"mapping_m": None, "mapping_in_map_m": None}
     plans = _perches(flight)
@@ -114,14 +114,14 @@ def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None
     point, cable = np.array(scenario.mission.perch_point), CableLine(scenario.world.cables[_target(scenario)])
     lines: list[Segment] = [line.segment for line in maps[-1].lines]
     samples = np.linspace(*min(lines, key=lambda line: float(line.distance(point))).ends, 400)
-    samples = samples[np.linalg.norm(samples - point, axis=1) < AROUND]
+    samples = samples[np.linalg.norm(samples - point, axis=1) < MAP_RADIUS]
     if not len(samples):
         return none
     moment = np.array([seconds(maps[-1].stamp)])
-    believed, true = estimate.at(moment), truth.at(moment)
-    turn = so3.quat_to_matrix(true.q[0]) @ so3.quat_to_matrix(believed.q[0]).T
-    seen = true.p[0] + (samples - believed.p[0]) @ turn.T
-    return {"mapping_m": float(np.mean([cable.nearest(p).distance for p in seen])),
+    estimated, true = estimate.at(moment), truth.at(moment)
+    turn = so3.quat_to_matrix(true.q[0]) @ so3.quat_to_matrix(estimated.q[0]).T
+    aligned = true.p[0] + (samples - estimated.p[0]) @ turn.T
+    return {"mapping_m": float(np.mean([cable.nearest(p).distance for p in aligned])),
             "mapping_in_map_m": float(np.mean([cable.nearest(p).distance for p in samples]))}
 
 
@@ -134,7 +134,7 @@ def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], li
     """Flights of each case by (case, whether the gripper works); finished ones of the same code are not flown again."""
     tasks = []
     jobs = [(seed, case, grips) for seed in effort.seeds_on_lines for grips in (True, False) for case in cases
-            if grips or case in WITHOUT_GRIP and seed <= SEEDS_WITHOUT_GRIP]
+            if grips or case in CASES_WITHOUT_GRIP and seed <= SEEDS_WITHOUT_GRIP]
     for number, (seed, case, grips) in enumerate(jobs):  # a flight keeps its number when seeds are added
         mapping: dict[str, Any] = extended_mapping("scenarios", case)
         if not grips:

@@ -15,7 +15,7 @@ from perch_control.mission.settings import MissionSettings
 from perch_core.errors import PlanningRefusal
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
-from perch_eval.control_flights.aborted import fly_aborted
+from perch_eval.control_flights.aborted import fly_cancelled
 from perch_eval.evaluation.document import table, write_page
 from perch_eval.evaluation.kept import cached_figures
 from perch_eval.evaluation.sections import Effort, Section
@@ -34,43 +34,43 @@ INCLINATIONS = (60, 90, 120)                              # [deg]
 LINES = ("line_20", "line_20_pa", "line_80", "line_80_pa", "line_180")
 PLANS, LINE_PLANS = 20, 2                                 # of each
 EDGES = (0.0, 0.05, 0.1, 0.15, 0.3, 0.5, 0.7, 1.0, math.inf)  # of time to contact [s]
-FLOWN = {"surface_60": 8, "surface_90": 12, "line_80": 2}  # flights that are cancelled, each at another time
-EARLIEST = 1.4                                            # time to contact at which the first of them is cancelled [s]
-SURE = MissionSettings().contact_early                    # nearer to the contact a surface may already be touched [s]
-BAR = 0.99                                                # share of the instants before that
+CANCELLED_FLIGHTS = {"surface_60": 8, "surface_90": 12, "line_80": 2}  # flights that are cancelled, each at another time
+MAX_TIME_TO_CONTACT = 1.4                                 # at which the first of them is cancelled [s]
+NO_CONTACT_BEFORE = MissionSettings().contact_early       # nearer to the contact a surface may already be touched [s]
+REQUIRED_SHARE = 0.99                                     # share of the instants before that with a way out
 
 
 class Instant(NamedTuple):
     """A state of a plan: time to contact [s], and why there is no way out of it; empty: there is one."""
 
-    left: float
+    time_to_contact: float
     refusal: str
 
 
 def sections(effort: Effort) -> list[Section]:
     """Share of instants with a way out, and cancelled flights; writes `way_out.md` and `way_out.json`."""
     out = Section("c_way_out", "Ways out of planned perches",
-                  f"Each plan is asked {RATE:g} times a second for a way out: a trajectory from its state at that time to a hover, with all limits "
+                  f"For each plan a way out is planned {RATE:g} times a second: a trajectory from its state at that time to a hover, with all limits "
                   f"proved (surfaces) or checked at 1 ms (powerlines). Surfaces: {PLANS} plans each, 1.2 to 3 m away, by the planner as shipped; "
                   f"powerlines: {LINE_PLANS} starts each.")
     jobs = [(name, seed) for name in map(str, INCLINATIONS) for seed in range(1, PLANS + 1)]
     jobs += [(name, seed) for name in LINES for seed in range(1, LINE_PLANS + 1)]
-    made = cached_figures(effort, "ways_out", jobs, _planned, lambda r: not r["refused"])
+    made = cached_figures(effort, "ways_out", jobs, _plan_instants, lambda r: not r["refused"])
     reasons: Counter[str] = Counter()
     rows: list[tuple[object, ...]] = []
     for name in (*map(str, INCLINATIONS), *LINES):
         plans = [r for r in made if r["name"] == name]
         instants = [Instant(*pair) for r in plans for pair in r["instants"]]
-        spans = [[x for x in instants if low <= x.left < high] for low, high in pairwise(EDGES)]
+        spans = [[x for x in instants if low <= x.time_to_contact < high] for low, high in pairwise(EDGES)]
         title = f"{name} deg" if name.isdigit() else name
         rows.append((title, *(_share(span) if span else "" for span in spans), _share(instants)))
         reasons.update(f"{title}: {x.refusal}" for x in instants if x.refusal)
-        early = [x for x in instants if x.left >= SURE]
+        early = [x for x in instants if x.time_to_contact >= NO_CONTACT_BEFORE]
         planned = sum(not r["refused"] for r in plans)
-        out.claim(f"{title}: a way out {SURE:g} s before contact and earlier", f"{_share(early)}; {planned} of {len(plans)} planned", "",
-                  planned == len(plans) and sum(not x.refusal for x in early) >= BAR * len(early) if early else None,
-                  f"at least {100 * BAR:g} %, all planned")
-    flown = cached_figures(effort, "aborted", list(_aborts()), _flown, lambda r: r["end"] in ("hovering", "attached"))
+        out.claim(f"{title}: a way out {NO_CONTACT_BEFORE:g} s before contact and earlier", f"{_share(early)}; {planned} of {len(plans)} planned", "",
+                  planned == len(plans) and sum(not x.refusal for x in early) >= REQUIRED_SHARE * len(early) if early else None,
+                  f"at least {100 * REQUIRED_SHARE:g} %, all planned")
+    flown = cached_figures(effort, "aborted", list(_cancellations()), _fly_cancelled, lambda r: r["end"] in ("hovering", "attached"))
     text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
             *table(" | ".join(("plans", *(f"{low:g} to {high:g}" for low, high in pairwise(EDGES[:-1])), f"from {EDGES[-2]:g}", "all")), rows), "",
             "## Refused", ""]
@@ -78,7 +78,7 @@ def sections(effort: Effort) -> list[Section]:
     text += ["", "## Cancelled flights", "", "The goal is cancelled on the way (modelled cameras, seeds from 1). *by a way out*: the controller left the "
              "plan by a planned way out; *attached*: cancelled too late, the perch went on.", ""]
     rows = []
-    for name, n in FLOWN.items():
+    for name, n in CANCELLED_FLIGHTS.items():
         own = [r for r in flown if r["scenario"] == name]
         ends = Counter(r["end"] for r in own)
         left = [r for r in own if r["planned"]]
@@ -88,7 +88,7 @@ def sections(effort: Effort) -> list[Section]:
         out.claim(f"{name}: cancelled on the way", f"{ends['hovering']} hovering, {ends['attached']} attached of {n}", "",
                   ends["hovering"] + ends["attached"] == n, "all")
     text += table("scenario | n | hovering | of these by a way out | attached | other | least thrust margin | largest body rate [rad/s]", rows)
-    text += ["", *table("scenario | seed | cancelled before contact [s] | end | by a way out | goal ended after [s] | the mission's words", (
+    text += ["", *table("scenario | seed | cancelled before contact [s] | end | by a way out | goal ended after [s] | message of the mission", (
         (r["scenario"], r["seed"], f"{r['before']:.2f}", r["end"], "yes" if r["planned"] else "no", f"{r['settled']:.2f}", r["message"]) for r in flown))]
     write_page(effort, "way_out", text, {"plans": made, "flights": flown})
     out.data = {"plans": made, "flights": flown}
@@ -100,18 +100,18 @@ def _share(instants: Sequence[Instant]) -> str:
     return f"{sum(not x.refusal for x in instants)} of {len(instants)}"
 
 
-def _aborts() -> Iterator[tuple[str, int, float]]:
+def _cancellations() -> Iterator[tuple[str, int, float]]:
     """Scenario, seed, and time before the contact [s]."""
-    for name, n in FLOWN.items():
+    for name, n in CANCELLED_FLIGHTS.items():
         for k in range(n):
-            yield name, k + 1, round(EARLIEST * (1.0 - (k + 0.5) / n), 3)
+            yield name, k + 1, round(MAX_TIME_TO_CONTACT * (1.0 - (k + 0.5) / n), 3)
 
 
-def _flown(job: tuple[str, int, float]) -> dict[str, Any]:
-    return asdict(fly_aborted(*job))
+def _fly_cancelled(job: tuple[str, int, float]) -> dict[str, Any]:
+    return asdict(fly_cancelled(*job))
 
 
-def _planned(job: tuple[str, int]) -> dict[str, Any]:
+def _plan_instants(job: tuple[str, int]) -> dict[str, Any]:
     """The instants of one plan."""
     name, seed = job
     rng = np.random.default_rng(seed)
@@ -126,9 +126,9 @@ def _surface(inclination: int, rng: np.random.Generator) -> list[Instant]:
     settings = NodeParameters(load_scenario("surface_90"), 1).of("perching_planner", PerchingPlannerParameters).settings
     vehicle = load_vehicle("snapdragon")
     place = np.array([rng.uniform(1.2, 3.0), rng.uniform(-0.5, 0.5), rng.uniform(1.2, 1.8)])
-    asked = PerchProblem(StartState(np.array([0.0, 0.0, 1.2])), PerchSurface.from_inclination(place, math.radians(inclination)))
-    perch = plan(asked, settings, vehicle).trajectory
-    return _instants(perch.duration, lambda t: plan_way_out(replace(asked, start=StartState.on(perch, t)), settings, vehicle))
+    request = PerchProblem(StartState(np.array([0.0, 0.0, 1.2])), PerchSurface.from_inclination(place, math.radians(inclination)))
+    perch = plan(request, settings, vehicle).trajectory
+    return _instants(perch.duration, lambda t: plan_way_out(replace(request, start=StartState.on(perch, t)), settings, vehicle))
 
 
 def _line(name: str, seed: int, rng: np.random.Generator) -> list[Instant]:
@@ -147,7 +147,7 @@ def _line(name: str, seed: int, rng: np.random.Generator) -> list[Instant]:
 
 
 def _instants(duration: float, way_out: Callable[[float], object]) -> list[Instant]:
-    """Those of a plan, each asked for its way out, which may be refused."""
+    """Those of a plan, each with its way out, which may be refused."""
     found = []
     for t in np.arange(0.0, duration, 1.0 / RATE).tolist():
         try:

@@ -87,7 +87,7 @@ def _perceive(args: argparse.Namespace) -> int:
 
 
 def _choose(sensors: Sensors, recording: Recording, given: str | None, preferred: str, option: str) -> str:
-    """A camera: the one that is given, else one with the usual name, else the first."""
+    """Return a camera: the given one, else the preferred one, else the first."""
     available = [name for name in sensors.cameras if recording.images.get(name)]
     if not available:
         raise PerchError(f"{recording.path}: there is no image")
@@ -132,7 +132,7 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
 
 
 def _add_motion(content: ReportContent, perception: Perception, vio: Trajectory, truth: Trajectory | None) -> None:
-    """Add the results of VIO and estimator."""
+    """Add the results of VIO and estimator to the report."""
     frames, states = perception.vio.frames, perception.states
     outcomes = {name: sum(f.outcome == name for f in frames) for name in dict.fromkeys(f.outcome for f in frames)}
     cost = 1e3 * np.array([f.cost for f in frames]) if frames else np.zeros(1)
@@ -167,7 +167,7 @@ def _add_motion(content: ReportContent, perception: Perception, vio: Trajectory,
 
 
 def _add_surroundings(content: ReportContent, perception: Perception) -> None:
-    """Add what was found of board and wires."""
+    """Add the results on board and wires to the report."""
     if perception.sightings:
         content.figures["target"], text = _board(perception)
         content.rows.append(("board", text))
@@ -182,7 +182,7 @@ def _add_surroundings(content: ReportContent, perception: Perception) -> None:
 
 
 def _board(perception: Perception) -> tuple[dict[str, float], str]:
-    """What was found of the board, which does not move: for JSON and as text."""
+    """Return the results on the board, which is static, as figures for JSON and in words."""
     found = [s for s in perception.sightings if s.pose_camera is not None]
     figures = {"images": len(perception.sightings), "found": len(found), "poses": len(perception.targets), "reprojection_rms_px": np.nan}
     text = f"found in {len(found)} of {len(perception.sightings)} images"

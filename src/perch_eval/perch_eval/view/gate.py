@@ -1,8 +1,9 @@
-"""A proxy in front of a WebSocket server that accepts every web page: it admits those with an allowed origin.
+"""Proxy in front of a WebSocket server that accepts every web page: it admits only pages of allowed origins.
 
-Browsers let any page open a WebSocket to this machine and send the page's origin; programs that are no browsers send none.
-Foxglove's server does not check it, so that any page a user visits could read the flight. It listens at a random address of the
-loopback network (127.0.0.0/8) and a random port, 39 bits that no page can guess in time, and this proxy at the public address.
+Browsers let any page open a WebSocket to this machine and send the page's origin to the server; other programs send none. As
+Foxglove's server does not check the origin, any page that a user visits could read the flight. The server therefore listens at a
+random address of the loopback network (127.0.0.0/8) and a random port, 39 bits that no page can guess in time, and this proxy at
+the public address.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n
 
 
 def unservable(host: str, port: int, error: OSError) -> ConfigError:
-    """Why an address cannot be served: it is in use, may not be used, or is none of this machine's."""
+    """Return the error for an address that cannot be served: in use, not permitted, or not one of this machine."""
     return ConfigError("viewer", "port", f"{host}:{port} cannot be served ({error.strerror}); choose another, as in --view 8766")
 
 
 def check_free(host: str, port: int) -> None:
-    """Make sure that a port can be served, before anything is started.
+    """Check that a port can be served, before anything is started.
 
     Raises:
-        ConfigError: it cannot.
+        ConfigError: it cannot be served.
     """
     try:
         socket.create_server((host, port)).close()
@@ -46,11 +47,11 @@ def hidden_host() -> str:
 
 
 def allowed(origin: str | None, origins: Iterable[str]) -> bool:
-    """Whether a page of an origin may connect.
+    """Return whether a page of an origin may connect.
 
     Args:
-        origin: as in the handshake, `scheme://host[:port]`; None: no browser.
-        origins: the allowed ones; without a port every port of the host, `*` all.
+        origin: as in the handshake, `scheme://host[:port]`; None: not a browser.
+        origins: allowed ones; without a port, every port of the host; `*`: all.
     """
     if origin is None:
         return True
@@ -76,14 +77,14 @@ def _port(origin: str) -> int | None:
 
 
 class Gate:
-    """Listens at an address and passes connections of allowed origins on."""
+    """Listens at an address and forwards connections of allowed origins."""
 
     def __init__(self, host: str, port: int, backend: tuple[str, int], origins: Iterable[str]) -> None:
         """
         Args:
             host, port: address that is served; port 0: any free one.
-            backend: address of the server.
-            origins: of web pages that may connect, see `allowed`.
+            backend: address of the server backend.
+            origins: allowed ones, see `allowed`.
 
         Raises:
             OSError: the address cannot be served.
@@ -104,7 +105,7 @@ class Gate:
         return self._server.sockets[0].getsockname()[1]
 
     def close(self) -> None:
-        """Accept no more connections, and end those that the server has not ended."""
+        """Stop accepting connections, and end those that the server behind has not ended."""
         asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(timeout=5.0)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(timeout=5.0)
@@ -138,14 +139,14 @@ class Gate:
 
 
 def _origin(header: bytes) -> str | None:
-    """Origin in a handshake; of several none that is allowed."""
+    """Return the origin in a handshake; of several, `null`, which is never allowed."""
     found = [value.strip().decode("latin-1") for name, _, value in (line.partition(b":") for line in header.split(b"\r\n")[1:])
              if name.strip().lower() == b"origin"]
     return (found[0] if len(found) == 1 else "null") if found else None
 
 
 async def _forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Bytes of one direction until its end, as fast as they are taken."""
+    """Forward the bytes of one direction until its end, as fast as they are accepted."""
     while data := await reader.read(CHUNK):
         writer.write(data)
         await writer.drain()

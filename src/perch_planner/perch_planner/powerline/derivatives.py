@@ -176,7 +176,8 @@ def hessian(stages: StageFunctions, x: ca.MX, p: Parameters, N: int, lam_f: ca.M
     add_terms("body_rate_between", between, STRIDE, 0, N)
     add_terms("run", f["run_hess"].map(N)(X[:, :N], U, 1.0 / N, p.run, lam_f), STRIDE, 0, N)
     if perception:
-        add_terms("perception", f["perception_gauss_newton" if gauss_newton else "perception_hess"].map(N)(X[:, :N], p.lines[0], p.perception, lam_f), STAGE_STATES, 0, N)
+        add_terms("perception", f["perception_gauss_newton" if gauss_newton else "perception_hess"].map(N)(
+            X[:, :N], p.lines[0], p.perception, lam_f), STAGE_STATES, 0, N)
     for i, (name, parameter) in enumerate(path):
         values = f[f"{name}_hess"].map(N)(X[:, 1:], parameter, lam_g[(at.inner + i).tolist()].T)
         add_terms(name, values, STAGE_STATES, 1, N)

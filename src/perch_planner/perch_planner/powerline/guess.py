@@ -14,32 +14,32 @@ from perch_planner.powerline.stage_functions import STAGE_STATES
 
 E3 = np.array([0.0, 0.0, 1.0])
 NEARLY_OPPOSITE = np.radians(150.0)
-ROLL_ASIDE = 0.5  # turn about b3 by which a perch with the line in view begins on one side [rad]
+SIDE_TURN = 0.5  # turn about b3 by which a perch with the line in view begins on one side [rad]
 
 
-def smooth(s: np.ndarray) -> np.ndarray:
+def smootherstep(s: np.ndarray) -> np.ndarray:
     """Quintic from 0 to 1 with zero slope and curvature at both ends."""
     s = np.clip(s, 0.0, 1.0)
     rising: np.ndarray = s**3 * (10 - 15 * s + 6 * s**2)
     return rising
 
 
-def turn_axis(b3_W: np.ndarray, s3_W: np.ndarray, lean_W: np.ndarray) -> tuple[np.ndarray, float]:
-    """Axis and angle that turn b3 into s3: the shortest way, or, where both are nearly opposite, the way through `lean_W`.
+def turn_axis(b3_W: np.ndarray, s3_W: np.ndarray, via_W: np.ndarray) -> tuple[np.ndarray, float]:
+    """Axis and angle that turn b3 into s3: the shortest way, or, where both are nearly opposite, the way through `via_W`.
 
     Every axis in the plane of b3 x s3 and b3 + s3 turns b3 into s3. For an upside-down perch on a wire that is inclined by
     one degree, the shortest way leads sideways, along the wire, unlike the way of the manoeuvre.
 
     Args:
         b3_W, s3_W: unit vectors in W, shape (3,).
-        lean_W: direction through which b3 turns where the angle is near 180 degrees, shape (3,).
+        via_W: direction through which b3 turns where the angle is near 180 degrees, shape (3,).
     """
     across, angle = np.cross(b3_W, s3_W), float(so3.angle_between(b3_W, s3_W))
     axis = across
     if angle > NEARLY_OPPOSITE:
-        wanted = np.cross(b3_W, lean_W)
+        preferred_axis = np.cross(b3_W, via_W)
         plane = [v / np.linalg.norm(v) for v in (across, b3_W + s3_W) if np.linalg.norm(v) > 1e-9]
-        axis = sum((wanted @ v) * v for v in plane) if plane else wanted
+        axis = sum((preferred_axis @ v) * v for v in plane) if plane else preferred_axis
     norm = np.linalg.norm(axis)
     if norm < 1e-9:
         return np.array([1.0, 0.0, 0.0]), angle
@@ -85,24 +85,24 @@ def side_turn(q_WB: np.ndarray, q_BC: np.ndarray, line_W: np.ndarray, towards_W:
     """
     normal_W = np.cross(line_W, E3)
     normal_W = normal_W if normal_W @ towards_W >= 0 else -normal_W
-    return -ROLL_ASIDE if facing_turn(q_WB, q_BC, normal_W) >= 0 else ROLL_ASIDE
+    return -SIDE_TURN if facing_turn(q_WB, q_BC, normal_W) >= 0 else SIDE_TURN
 
 
 def perch_guess(model: RotorModel, start: np.ndarray, p_end: np.ndarray, s3_W: np.ndarray, height_min: float,
-                intervals: int, duration: float | None = None, yaw_turn: float = 0.0, aside: float = 0.0
+                intervals: int, duration: float | None = None, yaw_turn: float = 0.0, b3_turn: float = 0.0
                 ) -> tuple[np.ndarray, np.ndarray]:
     """Initial guess of a perch: quintic in position, tilt in the last half.
 
     Args:
         model: constants.
         start: state, shape (17,).
-        p_end: wanted end position in W [m], shape (3,).
-        s3_W: wanted direction of b3 at the end, shape (3,).
+        p_end: required end position in W [m], shape (3,).
+        s3_W: required direction of b3 at the end, shape (3,).
         height_min: least height of the guess [m].
         intervals: N.
         duration: T [s]; chosen by distance when None.
         yaw_turn: turn about the vertical in the first quarter, towards the line [rad].
-        aside: turn about b3 until the end [rad].
+        b3_turn: turn about b3 until the end [rad].
 
     Returns:
         States and inputs, shapes (N + 1, 18) and (N, 4).
@@ -111,14 +111,14 @@ def perch_guess(model: RotorModel, start: np.ndarray, p_end: np.ndarray, s3_W: n
     T = perch_duration(start, p_end) if duration is None else duration
     states = np.zeros((intervals + 1, STAGE_STATES))
     way = p_end - start[:3]
-    states[:, :3] = start[:3] + smooth(s)[:, None] * way
+    states[:, :3] = start[:3] + smootherstep(s)[:, None] * way
     states[:, 7:10] = (30 * s**2 * (1 - s) ** 2)[:, None] * way / T
     states[:, 2] = np.maximum(states[:, 2], height_min)
     b3_W = so3.quat_to_matrix(start[3:7])[:, 2]
     axis, angle = turn_axis(b3_W, s3_W, -way)  # braking leans b3 back, away from the line
-    turn = so3.quat_exp(smooth(2 * s - 1)[:, None] * angle * axis)
-    yaw = so3.quat_exp(smooth(4 * s)[:, None] * yaw_turn * E3)
-    side = so3.quat_exp(smooth(s)[:, None] * aside * E3)
+    turn = so3.quat_exp(smootherstep(2 * s - 1)[:, None] * angle * axis)
+    yaw = so3.quat_exp(smootherstep(4 * s)[:, None] * yaw_turn * E3)
+    side = so3.quat_exp(smootherstep(s)[:, None] * b3_turn * E3)
     states[:, 3:7] = so3.quat_multiply(turn, so3.quat_multiply(so3.quat_multiply(yaw, start[3:7]), side))
     states[:, 10:13] = body_rates(states[:, 3:7], T)
     states[:, 13:17] = model.hover
@@ -139,10 +139,10 @@ def recovery_guess(model: RotorModel, start: np.ndarray, p_end: np.ndarray, heig
     way = p_end - start[:3]
     axis, angle = turn_axis(b3_W, E3, way)
     drop = 0.8 * angle / np.pi
-    states[:, :3] = start[:3] + smooth(s)[:, None] * (0.25 * way + 0.3 * b3_W - drop * E3)
+    states[:, :3] = start[:3] + smootherstep(s)[:, None] * (0.25 * way + 0.3 * b3_W - drop * E3)
     states[:, 2] = np.maximum(states[:, 2], height_min)
     states[:, 7:10] = np.gradient(states[:, :3], duration / intervals, axis=0)
-    states[:, 3:7] = so3.quat_multiply(so3.quat_exp(smooth(s / 0.6)[:, None] * angle * axis), start[3:7])
+    states[:, 3:7] = so3.quat_multiply(so3.quat_exp(smootherstep(s / 0.6)[:, None] * angle * axis), start[3:7])
     states[:, 10:13] = body_rates(states[:, 3:7], duration)
     states[:, 13:17] = model.hover
     states[:, STATES] = duration

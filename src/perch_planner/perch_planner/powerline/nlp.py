@@ -12,7 +12,7 @@ import numpy as np
 from perch_core.rotor_model import INPUTS, STATES
 from perch_planner.powerline.derivatives import STRIDE, Parameters, constraint_rows, end_size, hessian, jacobian, path_functions, split
 from perch_planner.powerline.stage_functions import (
-    END_WEIGHTS, LINE_SIZE, REFERENCE, RUN_WEIGHTS, PERCEPTION_WEIGHTS, STAGE_STATES, StageFunctions,
+    END_WEIGHTS, LINE_SIZE, PERCEPTION_WEIGHTS, REFERENCE, RUN_WEIGHTS, STAGE_STATES, StageFunctions,
 )
 
 _UNBOUNDED = np.inf

@@ -17,8 +17,8 @@ from perch_planner.powerline.plan import Manoeuvre
 from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.visibility import visibility
 
-PERCH, RECOVERY, SIGHT, WIRE = "#1f5fa8", "#d9822b", "#3a9a4b", "#b02a2a"
-SIGHT_LENGTH = 0.5  # of the drawn camera axis [m]
+PERCH, RECOVERY, CAMERA_AXIS, WIRE = "#1f5fa8", "#d9822b", "#3a9a4b", "#b02a2a"
+CAMERA_AXIS_LENGTH = 0.5  # of the drawn camera axis [m]
 
 
 class SideView:
@@ -33,8 +33,8 @@ class SideView:
     def __call__(self, points_W: np.ndarray) -> np.ndarray:
         """Project points in W, shape (..., 3), to (distance towards the line, height), shape (..., 2)."""
         points_W = np.asarray(points_W, float)
-        seen: np.ndarray = np.stack([(points_W - self.origin) @ self.right_W, points_W[..., 2]], axis=-1)
-        return seen
+        projected: np.ndarray = np.stack([(points_W - self.origin) @ self.right_W, points_W[..., 2]], axis=-1)
+        return projected
 
     def body(self, state: np.ndarray, radii: tuple[float, float, float]) -> np.ndarray:
         """Outline of the body's ellipsoid, shape (60, 2): the projection of an ellipsoid is an ellipse."""
@@ -61,11 +61,11 @@ def _scene(planned: PlannedProblem, axes: Axes) -> SideView:
 def _body(axes: Axes, view: SideView, planned: PlannedProblem, state: np.ndarray, colour: str) -> list[Any]:
     R_WB = so3.quat_to_matrix(state[Q])
     mount = planned.vehicle.mounts[planned.problem.settings.camera]
-    eye = state[P] + R_WB @ mount.p_BC
-    sight = view(np.stack([eye, eye + SIGHT_LENGTH * R_WB @ mount.R_BC[:, 2]]))
+    p_WC = state[P] + R_WB @ mount.p_BC
+    camera_axis = view(np.stack([p_WC, p_WC + CAMERA_AXIS_LENGTH * R_WB @ mount.R_BC[:, 2]]))
     thrust = view(np.stack([state[P], state[P] + 0.2 * R_WB[:, 2]]))
     return [*axes.plot(*view.body(state, planned.vehicle.body_radii).T, color=colour, lw=1.2),
-            *axes.plot(*thrust.T, color=colour, lw=1.2), *axes.plot(*sight.T, color=SIGHT, lw=1)]
+            *axes.plot(*thrust.T, color=colour, lw=1.2), *axes.plot(*camera_axis.T, color=CAMERA_AXIS, lw=1)]
 
 
 def draw_manoeuvre(planned: PlannedProblem, path: Path, bodies: int = 12) -> None:
@@ -100,10 +100,10 @@ def draw_visibility(planned: PlannedProblem, path: Path, without: Manoeuvre | No
     if without is not None:
         perches.append((without, RECOVERY, "without"))
     for part, colour, label in perches:
-        seen = visibility(part.states, planned.request.target(), mount)
-        top.plot(part.times, np.where(seen.cheirality, np.minimum(seen.reprojection, 2000), np.nan), color=colour, label=label)
-        middle.plot(part.times, seen.in_image, color=colour)
-        bottom.plot(part.times, np.where(seen.segment & seen.cheirality, 1, 0), color=colour)
+        metrics = visibility(part.states, planned.request.target(), mount)
+        top.plot(part.times, np.where(metrics.cheirality, np.minimum(metrics.reprojection, 2000), np.nan), color=colour, label=label)
+        middle.plot(part.times, metrics.in_image, color=colour)
+        bottom.plot(part.times, np.where(metrics.segment & metrics.cheirality, 1, 0), color=colour)
     top.set(ylabel="|reprojection| [px]", yscale="symlog", title=planned.problem.name)
     top.legend(fontsize=8)
     middle.set(ylabel="share of segment in image", ylim=(-0.05, 1.05))
@@ -119,13 +119,13 @@ def draw_animation(planned: PlannedProblem, path: Path, rate: float = 20.0) -> N
     trajectory = planned.plan.trajectory(planned.planner.solver.model, step=1 / rate)
     states = np.concatenate([trajectory.p, trajectory.q], axis=1)
     axes.plot(*view(trajectory.p).T, color="0.7", lw=1)
-    joint = planned.plan.perch.duration if planned.plan.perch is not None else 0.0
+    perch_end = planned.plan.perch.duration if planned.plan.perch is not None else 0.0
     drawn: list[Any] = []
 
     def frame(k: int) -> list[Any]:
         while drawn:
             drawn.pop().remove()
-        drawn.extend(_body(axes, view, planned, states[k], PERCH if trajectory.times[k] <= joint else RECOVERY))
+        drawn.extend(_body(axes, view, planned, states[k], PERCH if trajectory.times[k] <= perch_end else RECOVERY))
         axes.set_title(f"{trajectory.times[k]:.2f} s", fontsize=10)
         return drawn
 

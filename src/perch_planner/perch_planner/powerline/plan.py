@@ -69,9 +69,9 @@ class PowerlinePlan:
         if self.perch is None or self.recovery is None:
             return tuple(bound for part in self.parts for bound in part.bounds)
         shift = self.perch.duration
-        late = (replace(b, quantity=f"recovery_{b.quantity}", time_of_minimum=b.time_of_minimum + shift,
-                        time_of_maximum=b.time_of_maximum + shift) for b in self.recovery.bounds)
-        return (*self.perch.bounds, *late)
+        recovery_bounds = (replace(b, quantity=f"recovery_{b.quantity}", time_of_minimum=b.time_of_minimum + shift,
+                                   time_of_maximum=b.time_of_maximum + shift) for b in self.recovery.bounds)
+        return (*self.perch.bounds, *recovery_bounds)
 
     def trajectory(self, model: RotorModel, start_time: float = 0.0, step: float = 0.0) -> SampledTrajectory:
         """Perch and recovery as one trajectory for the controller.

@@ -15,20 +15,20 @@ from perch_planner.powerline.search import NotConverged, Search, Task
 from perch_planner.powerline.settings import PowerlineSettings
 
 FIRST_GUESSES = 2  # of a perch, before the limits are tried one at a time, and then IPOPT
-LAST_RESORT = 7.0  # times of a first attempt that does not converge, which IPOPT's greatest number of iterations takes
-FASTER = 2.0  # of the rotors, without the range of their thrust; thrust grows with the square
+IPOPT_TIME_FACTOR = 7.0  # times of a first attempt that does not converge, which IPOPT's greatest number of iterations takes
+SPEED_FACTOR = 2.0  # of the rotors, without the range of their thrust; thrust grows with the square
 
 
 class Relaxation(NamedTuple):
     """A limit, and a problem without it.
 
     Attributes:
-        words: its name in messages.
+        label: its name in messages.
         constraint: constraint of a refusal where this limit is the cause.
         relaxed: maps request, settings and vehicle to those without the limit.
     """
 
-    words: str
+    label: str
     constraint: str
     relaxed: Callable[[PowerlineRequest, PowerlineSettings, Vehicle], tuple[PowerlineRequest, PowerlineSettings, Vehicle]]
 
@@ -38,59 +38,59 @@ RELAXATIONS = (
     Relaxation("limit of the duration", "duration [P:eq14c]", lambda r, s, v: (r, replace(s, duration=(s.duration[0], 30.0)), v)),
     Relaxation("other lines", "clearance [P:eq14j]", lambda r, s, v: (replace(r, lines=(r.target(),)), s, v)),
     Relaxation("thrust range of the rotors", "rotor thrust [P:eq14f]",
-               lambda r, s, v: (r, s, replace(v, speed_min=0.0, speed_max=FASTER * v.speed_max))),
+               lambda r, s, v: (r, s, replace(v, speed_min=0.0, speed_max=SPEED_FACTOR * v.speed_max))),
     Relaxation("body-rate limit", "body rate", lambda r, s, v: (r, s, replace(v, body_rate_max=1e3))),
 )
 
 
-def fly_perch(search: Search, request: PowerlineRequest, pose: PerchPose, until: float) -> Manoeuvre:
+def plan_perch(search: Search, request: PowerlineRequest, pose: PerchPose, end_time: float) -> Manoeuvre:
     """Plan a perch; where the first guesses fail, remove limits one at a time, then try IPOPT while there is time.
 
     Args:
         search: of the vehicle, within all limits.
         request: with its deadline.
         pose: where to perch.
-        until: that deadline on the clock of `perf_counter` [s].
+        end_time: that deadline on the clock of `perf_counter` [s].
 
     Raises:
         PlanningRefusal: no perch was found; names the limit whose removal admits one, where that is known.
     """
     task = search.perch(request, pose)
     try:
-        return search.fly(task, guesses=FIRST_GUESSES)
+        return search.solve_and_check(task, guesses=FIRST_GUESSES)
     except NotConverged as refusal:
-        found, patience = _relaxed(search, task, refusal, until), refusal.patience
+        found, attempt_time = _relaxed(search, task, refusal, end_time), refusal.attempt_time
     if isinstance(found, Manoeuvre):
         return found
-    left = until - perf_counter() - (LAST_RESORT * patience if found.constraint != task.name else 0.0)  # a cause must not be lost
-    if left <= 0.0:
+    remaining = end_time - perf_counter() - (IPOPT_TIME_FACTOR * attempt_time if found.constraint != task.name else 0.0)  # keep time to report it
+    if remaining <= 0.0:
         raise found
     try:
-        return search.fly(replace(task, request=replace(request, solver="ipopt", deadline=left)), first=FIRST_GUESSES)
+        return search.solve_and_check(replace(task, request=replace(request, solver="ipopt", deadline=remaining)), first=FIRST_GUESSES)
     except NotConverged:
         raise found from None
 
 
-def _relaxed(search: Search, task: Task, refusal: NotConverged, until: float) -> Manoeuvre | PlanningRefusal:
+def _relaxed(search: Search, task: Task, refusal: NotConverged, end_time: float) -> Manoeuvre | PlanningRefusal:
     """Return a refusal with the first limit whose removal soon yields a perch, or that perch where it keeps all limits."""
-    words = f"none of these alone is seen to be the cause: {', '.join(relaxation.words for relaxation in RELAXATIONS)}"
+    explanation = f"no single limit was identified as the cause (tried: {', '.join(relaxation.label for relaxation in RELAXATIONS)})"
     for relaxation in RELAXATIONS:
-        if perf_counter() + refusal.patience > until:
-            words = f"no time was left to look for the cause, allow more than {task.request.deadline:g} s"
+        if perf_counter() + refusal.attempt_time > end_time:
+            explanation = f"no time was left to search for the cause; allow more than {task.request.deadline:g} s"
             break
         request, settings, vehicle = relaxation.relaxed(replace(task.request, solver="fatrop"), search.settings, search.vehicle)
-        wider = replace(search, settings=settings, vehicle=vehicle)
+        relaxed_search = replace(search, settings=settings, vehicle=vehicle)
         try:
-            found = wider.fly(wider.perch(request, task.wanted), "trial", guesses=1)
+            found = relaxed_search.solve_and_check(relaxed_search.perch(request, task.goal), "trial", guesses=1)
         except PlanningRefusal:
             continue
         bounds = search.bounds(task, found.times, found.states, found.rates)
-        broken = {str(bound): bound.margin for bound in bounds if not bound.holds}
+        violated = {str(bound): bound.margin for bound in bounds if not bound.holds}
         if found.duration > task.duration[1]:
-            broken[f"duration {found.duration:.2f} s, required at most {task.duration[1]:g} s"] = task.duration[1] - found.duration
-        if not broken:
+            violated[f"duration {found.duration:.2f} s, required at most {task.duration[1]:g} s"] = task.duration[1] - found.duration
+        if not violated:
             return replace(found, bounds=bounds)
-        first, margin = next(iter(broken.items()))
+        first, margin = next(iter(violated.items()))
         return PlanningRefusal(refusal.code, relaxation.constraint, margin,
-                               f"no perch was found that keeps the {relaxation.words}; without it there is one: {first}")
-    return PlanningRefusal(refusal.code, refusal.constraint, refusal.margin, f"{refusal}; {words}")
+                               f"no perch was found that keeps the {relaxation.label}; without it there is one: {first}")
+    return PlanningRefusal(refusal.code, refusal.constraint, refusal.margin, f"{refusal}; {explanation}")

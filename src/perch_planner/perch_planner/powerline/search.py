@@ -21,7 +21,7 @@ from perch_planner.powerline.nlp import ProblemData, Solution, Structure
 from perch_planner.powerline.plan import Manoeuvre
 from perch_planner.powerline.request import E3, PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import Margins, PowerlineSettings
-from perch_planner.powerline.solving import Solver, end_tolerances, end_weights, run_weights, perception_weights
+from perch_planner.powerline.solving import Solver, end_tolerances, end_weights, perception_weights, run_weights
 from perch_planner.powerline.stage_functions import line_parameters
 
 LINES_MAX = 6  # segments in the problem: the target and the nearest others; the check takes all
@@ -71,7 +71,7 @@ class NotConverged(PlanningRefusal):
     """Raised when no manoeuvre was found and the limit that prevents it is unknown.
 
     Attributes:
-        attempt_time: time of the first attempt [s]; a trial without a limit, with half as many iterations, takes less.
+        attempt_time: of the first attempt [s]; a trial without a limit, with half as many iterations, takes less.
     """
 
     def __init__(self, name: str, tried: str, attempt_time: float) -> None:
@@ -102,23 +102,24 @@ class Search:
     def perch(self, request: PowerlineRequest, pose: PerchPose) -> Task:
         """Return the task of a perch from the start of a request to a pose."""
         s, formulation, target = self.settings, self.formulation, request.target()
-        turn = b3_turn = 0.0
+        yaw_turn = b3_turn = 0.0
         if request.perception:
             q_BC = quat_from_matrix(self.vehicle.mounts[s.camera].R_BC)
             path = target.closest_point(pose.p_WB) - request.start[P]
-            turn = guess.facing_turn(request.start[Q], q_BC, path)
+            yaw_turn = guess.facing_turn(request.start[Q], q_BC, path)
             b3_turn = guess.side_turn(request.start[Q], q_BC, target.direction, path)
         T0 = guess.perch_duration(request.start, pose.p_WB)
 
         def first_guess(attempt: int, intervals: int) -> tuple[np.ndarray, np.ndarray]:
             return guess.perch_guess(self.solver.model, request.start, pose.p_WB, pose.s3_W, s.height_min + 0.05, intervals,
-                                     T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], turn, b3_turn)
+                                     T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], yaw_turn, b3_turn)
 
         approaching = min(s.margins.approaching, _clearance_margin(self._clearance(request.start, request.lines)))
         end_clearance_max = _clearance_margin(0.5 * self._clearance(np.concatenate([pose.p_WB, pose.q_WB]), request.lines))
         return Task(
             "perch", request, pose, _select_lines(request.lines, target, request.start[P], pose.p_WB), formulation.perch,
-            "perched" if formulation.hard_end else "", s.duration, s.margins, first_guess, formulation.accuracy, approaching=approaching, end_clearance_max=end_clearance_max)
+            "perched" if formulation.hard_end else "", s.duration, s.margins, first_guess, formulation.accuracy, approaching=approaching,
+            end_clearance_max=end_clearance_max)
 
     def recovery(self, request: PowerlineRequest, hover: np.ndarray) -> Task:
         """Return the task of a recovery from the start of a request towards a hover position [m], without perception."""

@@ -18,7 +18,7 @@ from perch_core.rotor_model import RotorModel
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.powerline import compiled
 from perch_planner.powerline.formulation import Weights
-from perch_planner.powerline.nlp import ProblemData, Problem, Solution, Structure
+from perch_planner.powerline.nlp import Problem, ProblemData, Solution, Structure
 from perch_planner.powerline.settings import PerceptionWeights
 from perch_planner.powerline.stage_functions import StageFunctions, StageModel, stage_functions
 
@@ -79,8 +79,8 @@ class Solver:
         Args:
             structure: selects the solver.
             data: the problem without defects.
-            start_phase: "gauss_newton" for a cold guess, "trial" for a cold guess with fewer iterations, "solve" for the solution of a
-                similar problem, "refine" for a guess that is right up to the integrator's error.
+            start_phase: "gauss_newton" for a cold guess, "trial" for a cold guess with fewer iterations, "solve" for the
+                solution of a similar problem, "refine" for a guess that is right up to the integrator's error.
 
         Returns:
             The solution of the last phase, with iterations and times of all; that of the first phase where it diverges.

@@ -30,32 +30,32 @@ def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: Powerli
     """
     if np.shape(request.start) != (17,):
         raise PlanningRefusal("bad_input", "start state", -1.0, f"start state has shape {np.shape(request.start)}, needs (17,)")
-    _finite({"start state": request.start, "hover": np.zeros(3) if request.hover is None else request.hover})
+    _check_finite({"start state": request.start, "hover": np.zeros(3) if request.hover is None else request.hover})
     norm = float(np.linalg.norm(request.start[Q]))
     if abs(norm - 1) > 1e-2:
         raise PlanningRefusal("bad_input", "start attitude", -abs(norm - 1), f"start quaternion has norm {norm:.4f}, not 1")
     if request.recovery_only:
-        _start(request, vehicle, settings)
+        _check_start(request, vehicle, settings)
         return None  # a recovery starts at a line
     pose, target = request.perch, request.target()
     if pose is None:
         raise PlanningRefusal("bad_input", "perch pose", -1.0, "no perch pose is given")
-    _finite({"perch position": pose.p_WB, "perch direction": pose.s3_W, "end velocity": pose.v_W})
-    _crossing(request.lines)
-    _start(request, vehicle, settings)
-    _clear(request, vehicle)
-    _perch(request, pose, target, vehicle, settings)
-    _ahead(request, pose, target, vehicle, settings)
+    _check_finite({"perch position": pose.p_WB, "perch direction": pose.s3_W, "end velocity": pose.v_W})
+    _check_crossings(request.lines)
+    _check_start(request, vehicle, settings)
+    _check_clearance(request, vehicle)
+    _check_perch(request, pose, target, vehicle, settings)
+    _check_bearing(request, pose, target, vehicle, settings)
     return pose
 
 
-def _finite(values: dict[str, np.ndarray]) -> None:
+def _check_finite(values: dict[str, np.ndarray]) -> None:
     for name, value in values.items():
         if not np.all(np.isfinite(value)):
             raise PlanningRefusal("bad_input", name, -1.0, f"{name} {np.asarray(value).tolist()} is not finite")
 
 
-def _crossing(lines: tuple[Segment, ...]) -> None:
+def _check_crossings(lines: tuple[Segment, ...]) -> None:
     trimmed = {line.id: replace(line, half_length=max(line.half_length - END_TRIM, 1e-3)) for line in lines}
     if len(trimmed) < len(lines):
         raise PlanningRefusal("bad_input", "line ids", -1.0, "two lines have the same id")
@@ -66,7 +66,7 @@ def _crossing(lines: tuple[Segment, ...]) -> None:
                                   f"lines {a.id} and {b.id} cross: their axes come within {segment_distance(a, b):.3f} m; the map is wrong")
 
 
-def _start(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> None:
+def _check_start(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSettings) -> None:
     start = request.start
     if start[2] < settings.height_min:
         raise PlanningRefusal("start_invalid", "height [P:eq14e]", start[2] - settings.height_min,
@@ -83,7 +83,7 @@ def _start(request: PowerlineRequest, vehicle: Vehicle, settings: PowerlineSetti
                               f"start rotor thrusts {low:.2f} .. {high:.2f} N are outside [0, {vehicle.thrust_max:.2f}] N")
 
 
-def _clear(request: PowerlineRequest, vehicle: Vehicle) -> None:
+def _check_clearance(request: PowerlineRequest, vehicle: Vehicle) -> None:
     for line in request.lines:
         clearance = float(scaled_clearance(request.start[None, P], request.start[None, Q], line, vehicle.body_radii)[0])
         if clearance < 0:
@@ -91,30 +91,30 @@ def _clear(request: PowerlineRequest, vehicle: Vehicle) -> None:
                                   f"line {line.id} is nearer than the body at the start: scaled distance {1 + clearance:.2f} < 1; move away first")
 
 
-def _perch(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
+def _check_perch(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
     if abs(np.linalg.norm(perch.s3_W) - 1) > 1e-3:
-        raise PlanningRefusal("bad_input", "perch direction", -1.0, "the wanted direction of b3 is not a unit vector")
+        raise PlanningRefusal("bad_input", "perch direction", -1.0, "the requested direction of b3 is not a unit vector")
     if perch.p_WB[2] < settings.height_min:
         raise PlanningRefusal("infeasible", "height [P:eq14e]", perch.p_WB[2] - settings.height_min,
                               f"perch height {perch.p_WB[2]:.3f} m is below height_min {settings.height_min:g} m")
-    longest, most = settings.duration[1], 4.0 * vehicle.thrust_max / vehicle.mass + GRAVITY  # all thrust and gravity in one direction
-    reach = float(np.linalg.norm(request.start[V])) * longest + 0.5 * most * longest**2
-    far = float(np.linalg.norm(perch.p_WB - request.start[P]))
-    if far > reach:
-        raise PlanningRefusal("infeasible", "duration", reach - far,
-                              f"the perch is {far:.1f} m away; in {longest:g} s no more than {reach:.1f} m can be flown; start nearer")
+    duration_max, acceleration_max = settings.duration[1], 4.0 * vehicle.thrust_max / vehicle.mass + GRAVITY  # all thrust and gravity in one direction
+    reach = float(np.linalg.norm(request.start[V])) * duration_max + 0.5 * acceleration_max * duration_max**2
+    distance = float(np.linalg.norm(perch.p_WB - request.start[P]))
+    if distance > reach:
+        raise PlanningRefusal("infeasible", "duration", reach - distance,
+                              f"the perch is {distance:.1f} m away; in {duration_max:g} s no more than {reach:.1f} m can be flown; start nearer")
     for line in request.lines:
         clearance = float(scaled_clearance(perch.p_WB[None], perch.q_WB[None], line, vehicle.body_radii)[0])
         if clearance < 0:
             raise PlanningRefusal("perch_in_collision", "clearance [P:eq14j]", clearance,
                                   f"at the perch pose the body cuts line {line.id}: scaled distance {1 + clearance:.2f} < 1")
-    miss = float(target.distance(perch.p_WB - vehicle.wire_offset * perch.s3_W))
-    if miss > GRIPPER_ERROR_MAX:
-        raise PlanningRefusal("bad_input", "gripper", GRIPPER_ERROR_MAX - miss,
-                              f"at the perch pose the gripper is {miss:.3f} m off line {target.id} (allowed {GRIPPER_ERROR_MAX:g} m)")
+    gripper_error = float(target.distance(perch.p_WB - vehicle.wire_offset * perch.s3_W))
+    if gripper_error > GRIPPER_ERROR_MAX:
+        raise PlanningRefusal("bad_input", "gripper", GRIPPER_ERROR_MAX - gripper_error,
+                              f"at the perch pose the gripper is {gripper_error:.3f} m off line {target.id} (allowed {GRIPPER_ERROR_MAX:g} m)")
 
 
-def _ahead(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
+def _check_bearing(request: PowerlineRequest, perch: PerchPose, target: Segment, vehicle: Vehicle, settings: PowerlineSettings) -> None:
     axis_W = so3.quat_to_matrix(request.start[Q]) @ vehicle.mounts[settings.camera].R_BC[:, 2]
     way = target.closest_point(perch.p_WB) - request.start[P]
     bearing = float(np.degrees(so3.angle_between(axis_W, way)))

@@ -56,13 +56,13 @@ def visibility(states: np.ndarray, line: lines.Segment, mount: CameraMount) -> V
     n_I, l_I = lines.image_line(o_C, l_C, fx, fy)
     place, depth = lines.segment_place(*lines.image_line(o_C, l_C), o_C, line.half_length)
     points_W = line.centre + np.linspace(-line.half_length, line.half_length, SAMPLES)[:, None] * line.direction
-    seen = np.empty(len(states))
+    in_image = np.empty(len(states))
     for k, state in enumerate(states):
         R_WC = so3.quat_to_matrix(state[Q]) @ mount.R_BC
         points_C = (points_W - state[P] - so3.quat_to_matrix(state[Q]) @ mount.p_BC) @ R_WC
         pixels, valid = mount.camera.project(points_C)
         inside = valid & (pixels >= 0).all(axis=1) & (pixels[:, 0] < mount.camera.width) & (pixels[:, 1] < mount.camera.height)
-        seen[k] = inside.mean()
+        in_image[k] = inside.mean()
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.abs(lines.reprojection_error(n_I))
-    return Visibility(error, lines.cheirality(n_I, l_I) > 0, np.abs(place) < np.abs(depth), seen)
+    return Visibility(error, lines.cheirality(n_I, l_I) > 0, np.abs(place) < np.abs(depth), in_image)
