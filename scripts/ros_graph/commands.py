@@ -69,7 +69,7 @@ def carry_out(command_line: argparse.ArgumentParser) -> int:
     """Parse, set up if necessary, and run the sub-command; errors become one line, Ctrl-C and a closed pipe end it quietly.
 
     Returns:
-        The exit code: that of the sub-command, or 2 for the caller's mistakes.
+        The exit code: that of the sub-command, or 2 for invalid input.
     """
     arguments = command_line.parse_args()
     enter()

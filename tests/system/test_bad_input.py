@@ -86,7 +86,7 @@ def test_arguments_of_the_demo(arguments, words, capsys):
     assert words in error and len(error.splitlines()) == 1
 
 
-def test_a_parameter_that_a_node_refuses_is_the_caller_s_mistake(tmp_path):
+def test_a_parameter_that_a_node_refuses_is_invalid_input(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text(BLIND.replace("{vehicle", "{estimator: {coasting_after: 7000.0}, vehicle"))
     result = run_script("demo.py", "--scenario", str(file), "--out", str(tmp_path), "--composed", *sorted(set(ALL_NODES) - {"estimator"}))

@@ -58,7 +58,7 @@ def call(command: list[str], capsys) -> tuple[int, str, str]:
 
 
 def refused(command: list[str], capsys) -> str:
-    """What a command says that ends as the caller's mistake, before a worker is started."""
+    """The message of a command that ends with invalid input, before a worker is started."""
     code, _, words = call(command, capsys)
     assert code == 2
     return words
@@ -175,5 +175,5 @@ def test_runs_that_break_are_results_and_do_not_mix_with_those_of_other_settings
     assert "other settings" in refused(campaign("broken", 13, "--resume"), capsys)
 
 
-def test_an_unreachable_scheduler_is_the_callers_mistake(campaign, capsys):
+def test_an_unreachable_scheduler_is_invalid_input(campaign, capsys):
     assert "nonsense" in refused(campaign("quick", 5, "--cluster", "nonsense://nowhere"), capsys)

@@ -64,7 +64,7 @@ def test_echo_of_a_field_that_does_not_exist(run):
     assert result.stderr == "error: --field point.w: 'w' does not exist; there are: x, y, z\n"
 
 
-def test_a_topic_that_does_not_exist_is_the_caller_s_mistake(peer):
+def test_a_topic_that_does_not_exist_is_invalid_input(peer):
     result = fork_script("topic.py", "echo", "/nothing", "--spin-time", "0.1", **peer)
     assert result.returncode == 2 and "topic /nothing does not exist in ROS domain" in result.stderr
     assert len(result.stderr.splitlines()) == 1

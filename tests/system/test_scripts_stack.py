@@ -129,14 +129,14 @@ def test_mistakes_of_the_caller_are_one_clear_line(arguments, words, tmp_path):
     assert words in result.stderr and "Traceback" not in result.stderr + result.stdout
 
 
-def test_a_parameter_that_a_node_refuses_is_the_callers_mistake(domain, tmp_path):
+def test_a_parameter_that_a_node_refuses_is_invalid_input(domain, tmp_path):
     """What each node refuses is shown in test_bad_input.py."""
     result = run_script("start_stack.py", "--only", "estimator", "-p", "estimator.coasting_after:=7000.0", "--domain", domain, "--log-dir", str(tmp_path))
     assert result.returncode == 2
     assert "coasting_after: 7000 is outside" in result.stderr and "Traceback" not in result.stderr + result.stdout
 
 
-def test_a_port_in_use_is_the_callers_mistake(domain, tmp_path):
+def test_a_port_in_use_is_invalid_input(domain, tmp_path):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

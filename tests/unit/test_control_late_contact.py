@@ -23,7 +23,7 @@ def touch(name, farther):
         farther: distance of the surface behind the place at which it is believed to be [m].
     """
     plan, vehicle = perch(name), load_vehicle("snapdragon")
-    params = NodeParameters(load_scenario("surface_90"), 1).of("controller", ControllerParameters)  # those that are flown
+    params = NodeParameters(load_scenario("surface_90"), 1).node_config("controller", ControllerParameters)  # those that are flown
     loop = make_loop(settings=params.flight, law=GeometricController(vehicle, params.gain_set))
     loop.begin_in_hover()
     loop.plant.floor = -10.0

@@ -65,7 +65,7 @@ def test_parts_have_their_places_on_the_page_whatever_order_they_are_asked_for_i
 
 
 @pytest.mark.parametrize("arguments", [["--jobs", "0"], ["--seeds", "-1"], ["--line-seeds", "many"], ["--quick", "--full"]])
-def test_wrong_arguments_are_the_callers_mistake(arguments):
+def test_wrong_arguments_are_invalid_input(arguments):
     with pytest.raises(SystemExit) as end:
         command.main(arguments)
     assert end.value.code == 2

@@ -217,7 +217,7 @@ def test_a_damaged_recording_is_said_to_be_one(recorded, tmp_path, capsys):
         assert "cut off or damaged" in said and "holds no ground_truth/odometry as far as it can be read" in said
 
 
-def test_no_recording_is_the_callers_mistake(tmp_path, capsys):
+def test_no_recording_is_invalid_input(tmp_path, capsys):
     assert main([str(tmp_path / "none.mcap")]) == 2
     (tmp_path / "empty.mcap").write_bytes(b"")
     assert main([str(tmp_path / "empty.mcap")]) == 2

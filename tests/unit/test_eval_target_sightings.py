@@ -5,7 +5,7 @@ import pytest
 from perch_core.vehicle import load_vehicle
 from perch_eval import consistency
 from perch_eval.estimation_flight import EstimatorTrack, Flight, motion_of
-from perch_eval.in_process.modelled_sight import ModelledSight
+from perch_eval.in_process.modelled_sight import ModelledLocalizer
 from perch_eval.perch_motion import ImuReadings
 from perch_eval.target_sightings import estimated_body, localize_target
 from perch_perception.target_localizer import TargetLocalizerConfig
@@ -50,6 +50,6 @@ def test_errors_of_the_body_move_vehicle_and_target_alike(hover):
 def test_an_image_from_before_the_truth_was_heard_first_shows_nothing():
     truth = StateHistory(10)
     truth.append(TrueState(1_490_000_000, np.r_[np.zeros(3), 0.0, 0.0, 0.0, 1.0, np.zeros(6)]))
-    sight = ModelledSight(TargetLocalizerConfig(), load_scenario("surface_90_ideal"), 1, truth, lambda: None)
+    sight = ModelledLocalizer(TargetLocalizerConfig(), load_scenario("surface_90_ideal"), 1, truth, lambda: None)
     found = sight.process(None, 1.148, None)
     assert found.board is None and "outside" in found.message

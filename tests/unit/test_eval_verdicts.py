@@ -9,7 +9,7 @@ from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_eval.evaluation import control, inspection, ways_out
 from perch_eval.evaluation.sections import Effort
-from perch_eval.inspection.measures import inspected, judge, reference_states, segments, watched
+from perch_eval.inspection.measures import inspection_result, judge, reference_states, segments, watched
 from perch_sim.scenario import load_scenario
 
 
@@ -47,7 +47,7 @@ def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch)
 def test_an_inspection_that_is_given_up_has_not_avoided_the_lines(effort, monkeypatch):
     scenario = load_scenario("inspection")
     times, states = reference_states(scenario)
-    still = inspected(scenario, times[:50], np.repeat(states[:1], 50, axis=0), 0, "the controller has landed")
+    still = inspection_result(scenario, times[:50], np.repeat(states[:1], 50, axis=0), 0, "the controller has landed")
     monkeypatch.setattr(inspection, "fly", lambda *_: still)
     assert still.collisions == 0 and verdicts(inspection._figures(effort))["collisions"] == "fails"
     monkeypatch.setattr(inspection, "fly", lambda *_: dataclasses.replace(still, message=""))

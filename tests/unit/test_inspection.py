@@ -17,7 +17,7 @@ from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.inspection.flight import fly
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.layout import random_layout
-from perch_eval.inspection.measures import clearance, collisions, inspected, judge, reference_of, reference_states, segments, watched
+from perch_eval.inspection.measures import clearance, collisions, inspection_result, judge, reference_of, reference_states, segments, watched
 from perch_control.mission.parameters import MissionParameters
 from perch_control.parameters import ControllerParameters
 from perch_sim.scenario import Scenario, Start, Waypoint, load_scenario
@@ -70,10 +70,10 @@ def test_collisions_are_counted_by_their_beginnings():
 
 def test_a_scenario_says_what_its_nodes_fly():
     params = NodeParameters(BASE, 1)
-    places = params.of("mission", MissionParameters).mission.places
+    places = params.node_config("mission", MissionParameters).mission.places
     assert [tuple(p) for p, _ in places] == [w.position for w in BASE.inspection.waypoints]
     assert places[0][1] == pytest.approx(math.radians(BASE.inspection.waypoints[0].yaw_deg))
-    assert params.of("controller", ControllerParameters).nmpc.lines.watched == BASE.inspection.watched
+    assert params.node_config("controller", ControllerParameters).nmpc.lines.watched == BASE.inspection.watched
     with pytest.raises(ConfigError, match="waypoints.*needs at least 2"):
         config.from_mapping(Scenario, {"name": "x", "mode": "inspection"}, "x.yaml")
     with pytest.raises(ConfigError, match=r"waypoints\[1\].position: \(1, 0, 9\) m is outside the room"):
@@ -117,12 +117,12 @@ def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, res
 
 def test_a_way_that_is_the_reference_is_judged_as_the_reference_and_drawn(tmp_path):
     times, states = reference_states(BASE)
-    found = inspected(BASE, times, states)
+    found = inspection_result(BASE, times, states)
     assert found.collisions == found.reference.collisions == 2 and found.flown.reprojection == found.reference.reprojection
-    assert inspected(BASE, times[:100], states[:100], crashes=1).collisions == 1
+    assert inspection_result(BASE, times[:100], states[:100], crashes=1).collisions == 1
     away = states.copy()
     away[:, 0] -= 2.0
-    assert inspected(BASE, times, away).collisions == 0
+    assert inspection_result(BASE, times, away).collisions == 0
     for name, figure in (("paths", paths_figure(found)), ("metrics", metrics_figure(found))):
         figure.savefig(tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
@@ -140,7 +140,7 @@ def test_the_line_terms_avoid_the_collision_and_keep_the_line_centred():
     flight = fly(scenario, 1)
     assert not flight.message and flight.collisions == 0 and flight.reference.collisions == 1
     assert flight.reference.reprojection > 5.0 * flight.flown.reprojection
-    assert flight.flown.seen.cheirality.all()
+    assert flight.flown.visibility.cheirality.all()
     assert flight.times[-1] == pytest.approx(reference_of(scenario).duration, abs=0.05)
 
 

@@ -120,7 +120,7 @@ def test_a_killed_program_is_named_with_the_signal(tmp_path):
         assert "victim ended: killed by SIGKILL" in str(stack.wait()[0])
 
 
-def test_exit_code_2_is_the_caller_s_mistake(tmp_path):
+def test_exit_code_2_is_invalid_input(tmp_path):
     with Stack([python("node", "raise SystemExit(2)", nodes=("/node",))], tmp_path) as stack:
         with pytest.raises(StackError) as error:
             stack.wait_until_ready(set, timeout=PATIENCE)

@@ -31,12 +31,12 @@ def command_parser(name: str, description: str | None, examples: str) -> argpars
 
 def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argparse.Namespace], int], *refusals: type[Exception],
             interrupted: str = "interrupted") -> Callable[..., int]:
-    """Return a program's `main`. Exit code: that of `work`; 2, with a one-line error, for a caller's mistake; 130 after Ctrl-C.
+    """Return a program's `main`. Exit code: that of `work`; 2, with a one-line error, for invalid input; 130 after Ctrl-C.
 
     Args:
         parser: returns the command-line parser.
         work: does the program's work with the parsed arguments and returns the exit code.
-        refusals: exceptions that count as the caller's mistake, beside `PerchError` and `OSError`.
+        refusals: exceptions that count as invalid input, beside `PerchError` and `OSError`.
         interrupted: message after Ctrl-C.
     """
     errors: tuple[type[Exception], ...] = (OSError, PerchError, *refusals)

@@ -17,7 +17,7 @@ from perch_core.component import Input
 from perch_core.config import quantity, text
 from perch_core.ros.node import node
 from perch_core.values import CameraImage, CameraModel, OdometryState
-from perch_eval.in_process.modelled_sight import MappedWorld, ModelledSight
+from perch_eval.in_process.modelled_sight import ModelledMap, ModelledLocalizer
 from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
@@ -52,7 +52,7 @@ class TruthLocalizer(TargetLocalizer):
         """
         scenario = load_scenario(config.scenario)
         self._truth, self._newest = StateHistory(TRUTH_BUFFER), 0
-        self._sight = ModelledSight(config, scenario, config.seed, self._truth, lambda: pad_surface(scenario, (self._newest - START) * 1e-9))
+        self._sight = ModelledLocalizer(config, scenario, config.seed, self._truth, lambda: pad_surface(scenario, (self._newest - START) * 1e-9))
         super().__init__(config, self._sight)
 
     def _channel(self, port: str) -> str:
@@ -76,7 +76,7 @@ class TruthLocalizer(TargetLocalizer):
 
 
 TARGET_LOCALIZER = node("target_localizer", TruthLocalizer)
-POWERLINE_MAPPER = node("powerline_mapper", MappedWorld)
+POWERLINE_MAPPER = node("powerline_mapper", ModelledMap)
 NODES = {one.name: one for one in (TARGET_LOCALIZER, POWERLINE_MAPPER)}
 MODULE = "perch_eval.modelled_sight_node"
 

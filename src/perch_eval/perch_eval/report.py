@@ -20,7 +20,7 @@ from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
 from perch_eval.identification.responses import inner_loop_figure
 from perch_eval.inspection.figures import metrics_figure, paths_figure
-from perch_eval.inspection.measures import Inspected, recorded
+from perch_eval.inspection.measures import InspectionResult, recorded_inspection
 from perch_eval.margins import margin_text, margins
 from perch_eval.metrics import DURATION, diagnostics, flight_metrics, missed_deadlines, node_durations, rates
 from perch_eval.goal import SUCCESSES
@@ -63,7 +63,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         "rates_hz": rates(flight), "timings_ms": node_durations(flight),
         "missed_deadlines": missed_deadlines(flight), "recording_damage": flight.damage,
     }
-    inspection = recorded(flight, scenario)
+    inspection = recorded_inspection(flight, scenario)
     if inspection is not None:
         report["inspection"] = {
             "reference_collisions": inspection.reference.collisions, "collisions": inspection.collisions,
@@ -149,7 +149,7 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
             ("ended at", f"{report['simulated_time_s']:.2f} s of simulated time"), ("flight hash", report["flight_hash"][:16])]
 
 
-def _figures(view: FlightView | None, inspection: Inspected | None) -> list[tuple[str, Figure | None]]:
+def _figures(view: FlightView | None, inspection: InspectionResult | None) -> list[tuple[str, Figure | None]]:
     """Titles and figures."""
     figures: list[tuple[str, Figure | None]] = []
     if inspection is not None:
@@ -164,7 +164,7 @@ def _figures(view: FlightView | None, inspection: Inspected | None) -> list[tupl
     return figures
 
 
-def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Vehicle, inspection: Inspected | None) -> str:
+def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: Vehicle, inspection: InspectionResult | None) -> str:
     title = f"{scenario.name}, seed {report['seed']}"
     view = None
     with suppress(PerchError):

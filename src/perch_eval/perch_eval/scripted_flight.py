@@ -179,7 +179,7 @@ class ScriptedFlight:
             ConfigError: the scenario or a node's parameter is refused.
         """
         self.scenario = scenario
-        self.mission = ScriptedMission(NodeParameters(scenario, seed).of("mission", MissionParameters))
+        self.mission = ScriptedMission(NodeParameters(scenario, seed).node_config("mission", MissionParameters))
         self.loop = arrange(scenario, seed, without=("target_localizer", *without), script=self.mission)
         self.simulation = self.loop.vehicle.simulation
         self.controller: Controller = self.loop.components["controller"]

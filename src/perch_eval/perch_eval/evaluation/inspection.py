@@ -1,4 +1,4 @@
-"""[P] Fig. 4 and 5: inspection with the line terms in the NMPC, and the same over random layouts. [P:VI-A]"""
+"""[P] Fig. 4 and 5: inspection with the line terms in the NMPC, in one flight and over random layouts. [P:VI-A]"""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REQUIRED_GAIN = 5.0  # bar and paper: factor by which the mean reprojection erro
 
 
 def inspection_sections(effort: Effort) -> list[Section]:
-    """Fig. 4 and 5 of one flight, and the same figures over random layouts."""
+    """Return Fig. 4 and 5 of one flight, and the same measures over random layouts."""
     return [_figures(effort), _layouts(effort)]
 
 
@@ -40,19 +40,19 @@ def _figures(effort: Effort) -> Section:
     gain = flight.reference.reprojection / flight.flown.reprojection
     out.claim("mean reprojection error", f"{flight.reference.reprojection:.0f} -> {flight.flown.reprojection:.0f} px, {gain:.1f} times less",
               "500 % better, about 100 px", gain >= REQUIRED_GAIN, f"cut by >= {REQUIRED_GAIN:g} times")
-    out.show("line in front (14h), nearest point on the segment (14i)", f"{100 * flight.flown.seen.cheirality.mean():.1f} %, "
-             f"{100 * flight.flown.seen.segment.mean():.1f} % of the time", "always, but for brief instants")
+    out.show("line in front (14h), nearest point on the segment (14i)", f"{100 * flight.flown.visibility.cheirality.mean():.1f} %, "
+             f"{100 * flight.flown.visibility.segment.mean():.1f} % of the time", "always, but for brief instants")
     return out
 
 
 def fly_layout(seed: int) -> dict[str, float]:
-    """The figures of one random layout, with and without the line terms; the seed is that of the layout and of the flight."""
+    """Return the measures of one random layout, with and without the line terms; the seed is used for layout and flights."""
     layout = random_layout(load_scenario(SCENARIO), seed)
     flown, without_lines = fly(layout, seed), fly(layout, seed, with_lines=False)
     return {"seed": seed, "reference_collisions": flown.reference.collisions, "collisions": flown.collisions,
             "collisions_without": without_lines.collisions, "reference_px": flown.reference.reprojection,
             "flown_px": flown.flown.reprojection, "clearance": float(flown.flown.clearance.min()),
-            "cheirality": float(flown.flown.seen.cheirality.mean()), "segment": float(flown.flown.seen.segment.mean()),
+            "cheirality": float(flown.flown.visibility.cheirality.mean()), "segment": float(flown.flown.visibility.segment.mean()),
             "completed": not flown.message}
 
 

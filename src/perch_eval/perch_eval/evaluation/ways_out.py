@@ -1,4 +1,4 @@
-"""Ways out of planned perches: from each instant of a plan to a hover, and flights that are cancelled on the way."""
+"""Ways out of planned perches: trajectories from each instant of a plan to a hover, and flights that are cancelled on the way."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ REQUIRED_SHARE = 0.99                                     # share of the instant
 
 
 class Instant(NamedTuple):
-    """A state of a plan: time to contact [s], and why there is no way out of it; empty: there is one."""
+    """Instant of a plan: time to contact [s], and the reason why there is no way out from its state; empty: there is one."""
 
     time_to_contact: float
     refusal: str
 
 
 def sections(effort: Effort) -> list[Section]:
-    """Share of instants with a way out, and cancelled flights; writes `way_out.md` and `way_out.json`."""
+    """Return the share of instants with a way out and the cancelled flights; write `way_out.md` and `way_out.json`."""
     out = Section("c_way_out", "Ways out of planned perches",
                   f"For each plan a way out is planned {RATE:g} times a second: a trajectory from its state at that time to a hover, with all limits "
                   f"proved (surfaces) or checked at 1 ms (powerlines). Surfaces: {PLANS} plans each, 1.2 to 3 m away, by the planner as shipped; "
@@ -96,12 +96,12 @@ def sections(effort: Effort) -> list[Section]:
 
 
 def _share(instants: Sequence[Instant]) -> str:
-    """How many of them have a way out."""
+    """Return how many of the instants have a way out, as text."""
     return f"{sum(not x.refusal for x in instants)} of {len(instants)}"
 
 
 def _cancellations() -> Iterator[tuple[str, int, float]]:
-    """Scenario, seed, and time before the contact [s]."""
+    """Yield scenario, seed, and time of cancellation before the contact [s]."""
     for name, n in CANCELLED_FLIGHTS.items():
         for k in range(n):
             yield name, k + 1, round(MAX_TIME_TO_CONTACT * (1.0 - (k + 0.5) / n), 3)
@@ -112,7 +112,7 @@ def _fly_cancelled(job: tuple[str, int, float]) -> dict[str, Any]:
 
 
 def _plan_instants(job: tuple[str, int]) -> dict[str, Any]:
-    """The instants of one plan."""
+    """Compute the instants of one plan, or the reason for which it was refused."""
     name, seed = job
     rng = np.random.default_rng(seed)
     try:
@@ -123,7 +123,7 @@ def _plan_instants(job: tuple[str, int]) -> dict[str, Any]:
 
 
 def _surface(inclination: int, rng: np.random.Generator) -> list[Instant]:
-    settings = NodeParameters(load_scenario("surface_90"), 1).of("perching_planner", PerchingPlannerParameters).settings
+    settings = NodeParameters(load_scenario("surface_90"), 1).node_config("perching_planner", PerchingPlannerParameters).settings
     vehicle = load_vehicle("snapdragon")
     place = np.array([rng.uniform(1.2, 3.0), rng.uniform(-0.5, 0.5), rng.uniform(1.2, 1.8)])
     request = PerchProblem(StartState(np.array([0.0, 0.0, 1.2])), PerchSurface.from_inclination(place, math.radians(inclination)))
@@ -147,7 +147,7 @@ def _line(name: str, seed: int, rng: np.random.Generator) -> list[Instant]:
 
 
 def _instants(duration: float, way_out: Callable[[float], object]) -> list[Instant]:
-    """Those of a plan, each with its way out, which may be refused."""
+    """Return the instants of a plan; `way_out` is called with the time since its start [s] and raises where it is refused."""
     found = []
     for t in np.arange(0.0, duration, 1.0 / RATE).tolist():
         try:

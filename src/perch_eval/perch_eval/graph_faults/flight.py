@@ -1,4 +1,4 @@
-"""One flight on the real graph with one fault: a process for the node that is struck, no cameras, a pilot that sends the goal."""
+"""One flight on the real graph with one fault. The struck node has its own process; no cameras; a pilot sends the goal."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ name: surface_90_blind
 nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
 parameters: {perching_planner: {time_limit: 20.0}, mission: {mission.plan_lead: 1.5}, vehicle: {lockstep_timeout: 8.0}}
 """
-"""What is flown: without images. A busy machine may take its time to plan, 1.5 s instead of 0.1; the lockstep goes on without a node
-that hangs after 8 s instead of 60."""
+"""Scenario of the flights, without images. Plans begin 1.5 s after their request instead of 0.1 s, for a busy machine; the
+lockstep drops a node that hangs after 8 s instead of 60 s."""
 DOMAINS = range(43, 70)
 READY_TIMEOUT = 60.0  # for the nodes to come up [s]
 STALL_TIMEOUT = 30.0  # simulation time may stand still for so long [s]
@@ -42,21 +42,21 @@ CONTACT_DISTANCE = 0.15  # of the centre of mass from the pad where the contact 
 
 @dataclass(frozen=True)
 class Row:
-    """How a flight went.
+    """Result of one flight.
 
     Attributes:
-        fault, node, phase, mode, seed: what was done.
-        commit: of the code.
-        struck: simulation time of the fault [s]; None: the flight ended before.
-        before: height [m], speed [m/s] and tilt [deg] then.
-        end: hovering, landed, perched, motors off; anything else is not safe.
-        named: after so many seconds of wall-clock time the fault was named; None: never.
-        words: by whom, and how.
-        goal: the mission's result, or the pilot's error.
-        impact: fastest touch of the floor or a wall after the fault [m/s].
-        ended: other nodes that ended by themselves.
-        left: processes, sockets, shared memory that were left when all had been stopped.
-        duration: wall clock [s].
+        fault, node, phase, mode, seed: the case.
+        commit: commit of the code.
+        injection_wall_time: simulation time of the fault [s]; None: the flight ended before.
+        before: height [m], speed [m/s] and tilt [deg] at the fault.
+        end: hovering, landed, perched or motors off; any other end is not safe.
+        first_report: wall-clock time from the fault to its first report [s]; None: it was not reported.
+        words: source and text of that report.
+        goal: the mission's result, or the pilot's error message.
+        impact: largest normal speed of a contact with the floor or a wall after the fault [m/s].
+        ended_processes: other nodes that ended by themselves.
+        leftovers: processes, sockets and shared memory that remained after all nodes were stopped.
+        duration: wall-clock time of the flight [s].
     """
 
     fault: str
@@ -78,13 +78,13 @@ class Row:
 
 
 class _FaultInjector:
-    """Injects the fault when its time has come.
+    """Applies the fault injection_time its time.
 
     Attributes:
-        received: (seconds since the epoch, message) of the mission and the nodes.
-        injection_wall_time: of the fault, seconds since the epoch; None: not yet injected.
+        received: (seconds since the epoch, text) received by the pilot.
+        injection_wall_time: time of the fault, seconds since the epoch; None: not yet.
         injection_time: the same in simulation time [s].
-        before: the situation then.
+        before: situation injection_time the fault.
     """
 
     def __init__(self, case: Case, group: Group, watcher: Watcher, takeoff_height: float, pad: Any) -> None:
@@ -98,7 +98,7 @@ class _FaultInjector:
         self.before = Situation(0.0, 0.0, 0.0, 0.0, False, False)
 
     def on_phase(self, t: float, phase: str, message: str) -> None:
-        """Handle the mission's feedback; every message is kept."""
+        """Receive feedback of the goal: keep every message, and the start and duration of the mission's phases."""
         self.received.append((time.time(), message))
         if phase != self._phase and phase not in ("waiting", "cancelling"):
             self._phase, self._since = phase, self._watcher.time
@@ -106,7 +106,7 @@ class _FaultInjector:
             self._duration = float(planned[1]) if planned else self._duration
 
     def apply_if_due(self) -> None:
-        """Inject the fault if its time has come."""
+        """Apply the fault if its time has come."""
         if self.injection_wall_time is not None or not self._is_due():
             return
         case, group = self._case, self._group
@@ -124,10 +124,10 @@ class _FaultInjector:
                 group.start(case.node)
 
     def check_goal(self) -> None:
-        """As `apply_if_due`, while the goal is awaited.
+        """Like `apply_if_due`, while the pilot waits for the goal's end.
 
         Raises:
-            PerchError: the mission does not run any more, and the time to report the fault is over; no other node answers the goal.
+            PerchError: the mission was killed or stopped, and the time to report that is over; the goal will not be answered.
         """
         self.apply_if_due()
         mission_lost = self._case.node == "mission" and self._case.fault in ("kill", "stop")
@@ -136,7 +136,7 @@ class _FaultInjector:
 
     @property
     def report_time_over(self) -> bool:
-        """Whether the time to report the fault is over."""
+        """Whether the time to report the fault is over, or there was no fault yet."""
         return self.injection_wall_time is None or time.time() - self.injection_wall_time > REPORT_LIMIT + 0.5
 
     def _is_due(self) -> bool:
@@ -156,12 +156,12 @@ def fly(case: Case, folder: Path, commit: str) -> Row:
     """Fly one case.
 
     Args:
-        case: what happens.
+        case: case to be flown.
         folder: receives scenario, parameters and logs.
-        commit: of the code, for the row.
+        commit: commit of the code, for the row.
 
     Raises:
-        PerchError: the nodes do not come up.
+        PerchError: the nodes did not start.
     """
     began = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
@@ -204,7 +204,7 @@ def fly(case: Case, folder: Path, commit: str) -> Row:
 
 
 def _wait_for_end(pilot: MissionClient, watcher: Watcher, injector: _FaultInjector) -> str:
-    """Wait until an end is stable, and the time to report the fault is over."""
+    """Wait until an end lasts and the time to report the fault is over; return the end."""
     limit, since, last = time.monotonic() + TIME_LIMIT, watcher.time, ""
     while time.monotonic() < limit:
         pilot.spin(0.05)

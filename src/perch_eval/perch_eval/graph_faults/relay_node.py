@@ -1,8 +1,8 @@
-"""Forwards messages, and disturbs them on request: a node publishes on `direct/<channel>`, the others receive from this node.
+"""Relay that forwards messages and disturbs them on request: the node publishes on `direct/<channel>`, subscribers use the relay.
 
     python3 -m perch_eval.graph_faults.relay_node odometry estimator/status --ros-args
 
-A message on `relay/fault` (std_msgs/String) is what is done from then on: delay, drop, duplicate, reorder, or nothing.
+A message on `relay/fault` (std_msgs/String) sets the disturbance: delay, drop, duplicate or reorder; others forward unchanged.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PERIOD = 0.002  # of publishing delayed messages that are due [s]
 
 
 class Disturbance:
-    """The disturbance of the messages of one channel."""
+    """Disturbance of the messages of one channel."""
 
     def __init__(self, seed: int = 1) -> None:
         self.fault = ""
@@ -40,7 +40,7 @@ class Disturbance:
         self._delayed: deque[tuple[float, Any]] = deque()
 
     def forward(self, message: Any, now: float) -> list[Any]:
-        """The messages to publish when one is received, at a time of the monotonic clock [s]."""
+        """Return the messages to forward when a message arrives, at a time of the monotonic clock [s]."""
         if self.fault == "delay":
             self._delayed.append((now + DELAY, message))
             return []
@@ -57,7 +57,7 @@ class Disturbance:
         return [message]
 
     def due(self, now: float) -> list[Any]:
-        """The messages that were delayed until now."""
+        """Return the delayed messages that are due at a time of the monotonic clock [s]."""
         found = []
         while self._delayed and self._delayed[0][0] <= now:
             found.append(self._delayed.popleft()[1])
@@ -65,7 +65,7 @@ class Disturbance:
 
 
 class RelayNode(Node):
-    """One disturbance for each channel."""
+    """Node that relays channels, with one disturbance for each."""
 
     def __init__(self, channels: list[str]) -> None:
         super().__init__("relay")
@@ -96,7 +96,7 @@ class RelayNode(Node):
 
 
 def main() -> None:
-    """Forward the channels of the command line until SIGINT or SIGTERM."""
+    """Relay the channels of the command line until SIGINT or SIGTERM."""
     end = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
     stop = StopSignal()
     init_ros(sys.argv)

@@ -1,1 +1,1 @@
-"""Response of a vehicle to its commands, identified from a flight: lags, delay and gains of its inner loop, thrust, drag."""
+"""Identification of a vehicle from a flight: lags, delay and gains of its inner loop, thrust, drag."""

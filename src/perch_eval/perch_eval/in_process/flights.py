@@ -1,4 +1,4 @@
-"""Which components fly a scenario, and the flight from the goal to its end."""
+"""Selection of the components that fly a scenario, and the flight from the goal to its end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from perch_core.processes import without_collector
 from perch_core.values import NANOSECONDS, seconds
 from perch_eval.goal import goal_of, outcome_of
 from perch_eval.in_process.loop import Loop
-from perch_eval.in_process.modelled_sight import MapParameters, MappedWorld, modelled_localizer
+from perch_eval.in_process.modelled_sight import MapParameters, ModelledMap, modelled_target_localizer
 from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.in_process.trace import FlightTrace
 from perch_perception.target_localizer import TargetLocalizerConfig
@@ -24,45 +24,45 @@ from perch_sim.parameters import VehicleParameters
 from perch_sim.scenario import Scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
 
-PATIENCE = 15 * NANOSECONDS  # for a cancelled flight to come to its end [ns]
-LOOKS = ("model", "rendered")
+CANCEL_TIME = 15 * NANOSECONDS  # for a cancelled flight to come to its end [ns]
+SENSING_OPTIONS = ("model", "rendered")
 PLANNERS = {"surface": "perching_planner", "powerline": "powerline_planner"}
 
 
 @dataclass(frozen=True)
 class Sensing:
-    """Which cameras' images are rendered and looked at; who looks through the others is replaced by an error model."""
+    """Choice per camera: `rendered` images, or `model`, an error model in place of the component that processes them."""
 
-    vio: str = choice("model", options=LOOKS)
-    target: str = choice("model", options=LOOKS)
+    vio: str = choice("model", options=SENSING_OPTIONS)
+    target: str = choice("model", options=SENSING_OPTIONS)
 
     def __post_init__(self) -> None:
         for name in ("vio", "target"):
-            if getattr(self, name) not in LOOKS:
-                raise PerchError(f"sensing.{name}: {getattr(self, name)!r} is not one of {', '.join(LOOKS)}")
+            if getattr(self, name) not in SENSING_OPTIONS:
+                raise PerchError(f"sensing.{name}: {getattr(self, name)!r} is not one of {', '.join(SENSING_OPTIONS)}")
 
 
 def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, replace: Mapping[str, Component[Any]] | None = None,
             without: Collection[str] = (), script: Component[Any] | None = None) -> Loop:
-    """The flight of a scenario before its first step.
+    """Return the flight of a scenario before its first step.
 
     Args:
-        scenario: what is flown.
-        seed: of everything that is random; the same seed gives the same flight to the last bit.
+        scenario: scenario to be flown.
+        seed: seed of all random draws; the same seed gives bit-identical flights.
         sensing: which cameras are rendered.
-        replace: name -> component in the place of the scenario's.
-        without: names of components that do not take part.
-        script: leads the flight in the place of the mission: it works at every step before the controller.
+        replace: name -> component in place of the scenario's.
+        without: names of components that are left out.
+        script: component in place of the mission, executed at every step before the controller.
 
     Raises:
-        ConfigError: the scenario or a node's parameter is refused.
-        PerchError: something that has no error model.
+        ConfigError: the scenario or a node's parameter is invalid.
+        PerchError: a cable sags and would need an error model, which does not exist.
     """
     parameters, replace = NodeParameters(scenario, seed), replace or {}
     surface = scenario.mode == "surface"
-    finder = "target_localizer" if surface else "powerline_mapper"
+    localizer = "target_localizer" if surface else "powerline_mapper"
     left_out = {*without, *(("mission",) if script is not None else ())}
-    names = [name for name in ("vio" if sensing.vio == "rendered" else "vio_model", "estimator", finder, "controller", "mission")
+    names = [name for name in ("vio" if sensing.vio == "rendered" else "vio_model", "estimator", localizer, "controller", "mission")
              if name not in left_out]
     front = "target_localizer" in names or sensing.target == "rendered"  # its frames start work, whether or not they are drawn
     cameras = {(True, True): "all", (True, False): "down", (False, True): "front", (False, False): "none"}[sensing.vio == "rendered", front]
@@ -72,9 +72,9 @@ def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, repl
         if name in replace:
             components[name] = replace[name]
         elif name == "target_localizer" and sensing.target == "model":
-            components[name] = modelled_localizer(parameters.of(name, TargetLocalizerConfig), vehicle, seed)
+            components[name] = modelled_target_localizer(parameters.node_config(name, TargetLocalizerConfig), vehicle, seed)
         elif name == "powerline_mapper" and sensing.target == "model":
-            components[name] = MappedWorld(MapParameters(seed=seed), scenario)
+            components[name] = ModelledMap(MapParameters(seed=seed), scenario)
         else:
             components[name] = parameters.component(name)
     planner = PLANNERS.get(scenario.mode)
@@ -90,29 +90,29 @@ def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: flo
     """Fly a scenario once.
 
     Args:
-        scenario: what is flown.
-        seed: of everything that is random; the same seed gives the same flight to the last bit.
+        scenario: scenario to be flown.
+        seed: seed of all random draws; the same seed gives bit-identical flights.
         sensing: which cameras are rendered.
-        linger: flown on after the goal's end [s].
+        linger: simulated time after the goal's end [s].
 
     Raises:
-        ConfigError: the scenario or a node's parameter is refused.
-        PerchError: something that has no error model.
+        ConfigError: the scenario or a node's parameter is invalid.
+        PerchError: a cable sags and would need an error model, which does not exist.
     """
     return perch(arrange(scenario, seed, sensing), scenario, linger)
 
 
 def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
-    """Fly an arrangement from the scenario's goal to its end; arguments as those of `fly`."""
+    """Fly an arranged flight from the scenario's goal to its end; arguments as those of `fly`."""
     began = clock.perf_counter()
     goal = loop.send("mission", goal_of(scenario))
     limit = round(scenario.time_limit * NANOSECONDS)
     stamp = 0
-    with without_collector():  # a trace keeps what it is given: looking through that again and again takes a tenth of a flight's time
-        while goal.result is None and stamp < limit + PATIENCE:
+    with without_collector():  # a trace only grows: collecting garbage in it takes a tenth of a flight's time
+        while goal.result is None and stamp < limit + CANCEL_TIME:
             stamp = loop.step()
             goal.cancel_requested = stamp > limit
-        trace, result, late = loop.trace, goal.result, goal.cancel_requested
+        trace, result, timed_out = loop.trace, goal.result, goal.cancel_requested
         trace.end_time = seconds(stamp)
         goal.cancel_requested = False
         end = stamp + round(linger * NANOSECONDS)
@@ -122,7 +122,7 @@ def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
         trace.outcome, trace.message = "timeout", f"no end within {trace.end_time:.1f} s"
     else:
         trace.outcome, trace.message = outcome_of(result.error_code, scenario), result.message
-        if trace.outcome == "cancelled" and late:
+        if trace.outcome == "cancelled" and timed_out:
             trace.outcome = "timeout"
     trace.wall_time = clock.perf_counter() - began
     loop.close()

@@ -1,4 +1,4 @@
-"""Pictures of an inspection: the paths in space and the measures over time. [P:Fig.4, P:Fig.5]"""
+"""Figures of an inspection: paths in space and measures over time. [P:Fig.4, P:Fig.5]"""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from perch_core import so3
-from perch_eval.inspection.measures import Inspected
+from perch_eval.inspection.measures import InspectionResult
 
 FLOWN, REFERENCE, HEADING, WIRE, COLLISION = "#1f5fa8", "#555555", "#3a9a4b", "#b02a2a", "#e8402a"
-SIGHT_LENGTH = 0.35  # of the drawn camera axis [m]
+CAMERA_AXIS_LENGTH = 0.35  # of the drawn camera axis [m]
 
 
-def paths_figure(flight: Inspected) -> Figure:
-    """Reference and flight in space, as the paper's Fig. 4: where the reference collides it is red, the camera's axis green."""
+def paths_figure(flight: InspectionResult) -> Figure:
+    """Plot reference and flight in space, as the paper's Fig. 4: collisions of the reference in red, camera axis in green."""
     figure = Figure(figsize=(9, 6.5), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     p, r = flight.states[:, 0:3], flight.reference_states[:, 0:3]
@@ -27,7 +27,7 @@ def paths_figure(flight: Inspected) -> Figure:
     axes.plot(*hit.T, color=COLLISION, lw=4, label=f"collides ({flight.reference.collisions})")
     axes.plot(*p.T, color=FLOWN, lw=1.5, label=f"flown ({flight.collisions} collisions)")
     for k in np.linspace(0, len(p) - 1, 45).astype(int):
-        ahead = p[k] + SIGHT_LENGTH * so3.quat_to_matrix(flight.states[k, 3:7])[:, 0]
+        ahead = p[k] + CAMERA_AXIS_LENGTH * so3.quat_to_matrix(flight.states[k, 3:7])[:, 0]
         axes.plot(*np.stack([p[k], ahead]).T, color=HEADING, lw=1)
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     axes.set_box_aspect(high - low)
@@ -36,18 +36,18 @@ def paths_figure(flight: Inspected) -> Figure:
     return figure
 
 
-def metrics_figure(flight: Inspected) -> Figure:
-    """Clearance, reprojection error, cheirality and segment visibility over time, as the paper's Fig. 5."""
+def metrics_figure(flight: InspectionResult) -> Figure:
+    """Plot clearance, reprojection error, cheirality and segment visibility over time, as the paper's Fig. 5."""
     figure = Figure(figsize=(8, 7.5), layout="constrained")
     panels = figure.subplots(4, 1, sharex=True)
     ways = ((flight.reference_times, flight.reference, REFERENCE, "--", "reference"), (flight.times, flight.flown, FLOWN, "-", "flown"))
     for times, judged, colour, style, label in ways:
-        seen = judged.seen
+        measures = judged.visibility
         panels[0].plot(times, judged.clearance, color=colour, ls=style, label=label)
-        panels[1].plot(times, np.minimum(seen.reprojection, judged.corner), color=colour, ls=style,
+        panels[1].plot(times, np.minimum(measures.reprojection, judged.corner), color=colour, ls=style,
                        label=f"{label}, mean {judged.reprojection:.0f} px")
-        panels[2].plot(times, seen.cheirality.astype(int), color=colour, ls=style)
-        panels[3].plot(times, seen.segment.astype(int), color=colour, ls=style)
+        panels[2].plot(times, measures.cheirality.astype(int), color=colour, ls=style)
+        panels[3].plot(times, measures.segment.astype(int), color=colour, ls=style)
     panels[0].axhspan(-1.0, 0.0, color=COLLISION, alpha=0.2)
     panels[0].set(ylabel="scaled clearance", ylim=(-1.0, 3.0), title="inspection")
     panels[1].set(ylabel="|reprojection| [px]", ylim=(0.0, None))

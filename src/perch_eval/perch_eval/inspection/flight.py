@@ -1,6 +1,6 @@
-"""One inspection in process, led by a script: VIO and the map of the cables by their error models. [P:VI-A]
+"""Scripted inspection in process, with error models of VIO and of the map of the cables. [P:VI-A]
 
-The controller knows the state that the estimator has and a map with an error; truth enters through the sensors' models alone.
+The controller receives the estimated state and a map with errors; the true state is used by the sensors' models only.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from perch_control.modes import State
 from perch_control.nmpc.controller import LINE_RAMP
 from perch_core.errors import PerchError
 from perch_core.trajectory import rest_to_rest
-from perch_eval.inspection.measures import Inspected, reference_of, recorded
+from perch_eval.inspection.measures import InspectionResult, recorded_inspection, reference_of
 from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight
 from perch_sim.scenario import Scenario
 
 SETTLE = 1.0  # hover before the line terms begin, and when they have grown [s]
 
 
-def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> Inspected:
-    """Take off below the first waypoint, let the line terms grow, fly the waypoint lines.
+def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> InspectionResult:
+    """Take off to the first waypoint, wait until the line terms have full weight, and fly the waypoint lines.
 
     Args:
-        scenario: mode `inspection`.
-        seed: of everything that is random.
-        with_lines: False: the controller is not told of the lines, and follows the reference as it is.
+        scenario: scenario of mode `inspection`.
+        seed: seed of all random draws.
+        with_lines: whether the controller receives the lines; without them it follows the reference only.
 
     Raises:
         PerchError: the scenario is not an inspection, or the vehicle does not take off.
@@ -47,6 +47,6 @@ def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> Inspected:
     mission.follow(reference)
     flight.run(flight.time + LEAD + reference.duration)
     flying = mission.state in (State.TRACKING, State.HOVERING)
-    found = recorded(loop.trace.flight, scenario, "" if flying else mission.message)
+    found = recorded_inspection(loop.trace.flight, scenario, "" if flying else mission.message)
     assert found is not None
     return found

@@ -1,4 +1,4 @@
-"""Random places to inspect: three cables, and waypoints whose straight lines collide twice and look past the cable. [P:VI-A]"""
+"""Random layouts for inspection: three cables, and waypoints whose lines collide twice and keep the cable off-centre. [P:VI-A]"""
 
 from __future__ import annotations
 
@@ -13,38 +13,39 @@ from perch_core.vehicle import load_vehicle
 from perch_eval.inspection.measures import clearance, collisions, reference_states, segments
 from perch_sim.scenario import Cable, Scenario, Start, Waypoint
 
-RADIUS = 0.03           # of the cables [m]
+CABLE_RADIUS = 0.03     # [m]
 WAYPOINTS = 6
 OFF_CENTRE = (0.2, 0.6)  # height of the cable over the image centre at a waypoint, by its distance: 80 to 230 px of the rpg's camera
-APART = 0.15            # least distance between two cables [m]
-CLEAR = 0.3             # least scaled clearance at the first and at the last waypoint, and on the way up
-DRAWS = 1000
+MIN_SEPARATION = 0.15   # between two cables [m]
+MIN_CLEARANCE = 0.3     # scaled, at the first and at the last waypoint, and on the way up
+MAX_DRAWS = 1000
 
 
 def random_layout(base: Scenario, seed: int) -> Scenario:
-    """`base` with cables and waypoints drawn anew; the reference collides exactly twice.
+    """Return `base` with random cables and waypoints, such that the reference collides exactly twice.
 
-    The watched cable hangs about 4 m in front, up to 12 deg askew and 6 deg inclined; the waypoints run along it at a distance of
-    1.4 to 2.4 m, each so high or low that the cable is 80 to 230 px from the image centre, and up to 25 deg turned away.
-    One or two slanted cables cross the way of the reference; where it is one, the reference touches the watched cable itself.
+    The watched cable hangs about 4 m in front, with an azimuth of up to 12 deg and an inclination of up to 6 deg. The waypoints
+    run along it at 1.4 to 2.4 m; their heights put the cable 80 to 230 px from the image centre, their yaw is up to 25 deg off.
+    One or two slanted cables cross the reference; if only one does, the reference also touches the watched cable.
 
     Args:
-        base: everything that is not drawn.
-        seed: of the layout.
+        base: scenario with everything that is not drawn.
+        seed: seed of the layout.
 
     Raises:
-        RuntimeError: no such layout was drawn.
+        RuntimeError: no such layout was found.
     """
     rng = np.random.default_rng(seed)
     vehicle = load_vehicle(base.vehicle)
-    for _ in range(DRAWS):
+    for _ in range(MAX_DRAWS):
         scenario = _draw(base, rng)
         cables = segments(scenario)
         clear = clearance(reference_states(scenario)[1], cables, vehicle.body_radii)
         apart = min(segment_distance(a, b) for k, a in enumerate(cables) for b in cables[:k])
-        if apart > APART and min(clear[0], clear[-1]) > CLEAR and _way_up(scenario, cables, vehicle.body_radii) and collisions(clear) == 2:
+        if (apart > MIN_SEPARATION and min(clear[0], clear[-1]) > MIN_CLEARANCE
+                and _take_off_is_free(scenario, cables, vehicle.body_radii) and collisions(clear) == 2):
             return dataclasses.replace(scenario, name=f"{base.name}_{seed}")
-    raise RuntimeError(f"no layout within {DRAWS} draws of seed {seed}")
+    raise RuntimeError(f"no layout within {MAX_DRAWS} draws of seed {seed}")
 
 
 def _draw(base: Scenario, rng: np.random.Generator) -> Scenario:
@@ -77,17 +78,17 @@ def _draw(base: Scenario, rng: np.random.Generator) -> Scenario:
     inspection = dataclasses.replace(
         base.inspection, watched=_vector(centre),
         waypoints=tuple(Waypoint(position=_vector(p), yaw_deg=float(yaw)) for p, yaw in zip(points, yaws)))
-    world = dataclasses.replace(base.world, cables=tuple(Cable(start=_vector(a), end=_vector(b), radius=RADIUS) for a, b in cables))
+    world = dataclasses.replace(base.world, cables=tuple(Cable(start=_vector(a), end=_vector(b), radius=CABLE_RADIUS) for a, b in cables))
     start = Start(position=(float(points[0, 0]), float(points[0, 1]), 0.0), yaw_deg=float(yaws[0]))
     return dataclasses.replace(base, inspection=inspection, world=world, start=start)
 
 
-def _way_up(scenario: Scenario, cables: list[Segment], radii: Vector3) -> bool:
-    """The take-off, straight up to the first waypoint, is free."""
+def _take_off_is_free(scenario: Scenario, cables: list[Segment], radii: Vector3) -> bool:
+    """Return whether the take-off, straight up to the first waypoint, is clear of the cables."""
     x, y, z = scenario.inspection.waypoints[0].position
     column = np.column_stack([np.full(30, x), np.full(30, y), np.linspace(0.0, z, 30)])
     level = np.tile([0.0, 0.0, 0.0, 1.0], (30, 1))
-    return all(float(scaled_clearance(column, level, c, radii).min()) > CLEAR for c in cables)
+    return all(float(scaled_clearance(column, level, c, radii).min()) > MIN_CLEARANCE for c in cables)
 
 
 def _vector(v: np.ndarray) -> tuple[float, float, float]:

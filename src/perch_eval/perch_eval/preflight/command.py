@@ -1,4 +1,4 @@
-"""The program `preflight`."""
+"""Command line program `preflight`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ USER_TIMEOUT = 60.0  # for an action by hand [s]
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     out = command_parser("preflight.py", "Check a running vehicle before it flies.", EXAMPLES)
     out.add_argument("--vehicle", required=True, help="vehicle file, or its name in config/vehicles")
     out.add_argument("--sensors", default="", help="sensor file that its nodes are given: axes of the IMU")
@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def imu_in_body(listener: Any, sensors: str) -> list[ImuSample]:
-    """The received IMU samples in the axes of B, rotated as by the nodes; none where their axes are not known."""
+    """Return the received IMU samples in the axes of B, rotated as in the nodes; without samples of unknown axes."""
     axes = ImuAxes(lambda *_: None, sensors)
     for _, transform in listener.values["/tf_static"]:
         axes.add_transform(transform)
@@ -52,7 +52,7 @@ def imu_in_body(listener: Any, sensors: str) -> list[ImuSample]:
 
 
 def passive_checks(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]:
-    """Checks of a vehicle at rest."""
+    """Return the checks of a vehicle at rest."""
     values = {channel: [value for _, value in entries] for channel, entries in listener.values.items()}
     channels = [c for c in checks.RATES if not c.startswith("camera_") or c.split("/")[0].removeprefix("camera_") in vehicle.mounts]
     found = [check for channel in channels for check in checks.check_stream(channel, [value.stamp for value in values[channel]])]
@@ -66,7 +66,7 @@ def passive_checks(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]
 
 
 def rotation_check(listener: Any, vehicle: Vehicle, camera: str | None, sensors: str) -> Check:
-    """The rotation between camera and IMU, measured while the vehicle is shaken; not exercised without a camera."""
+    """Ask for the vehicle to be shaken and check the rotation between camera and IMU; without a camera it is not exercised."""
     turned = np.zeros((0, 3)), np.zeros((0, 3))
     if camera:
         listener.subscribe_camera(camera, vehicle.mounts[camera].camera)
@@ -79,10 +79,7 @@ def rotation_check(listener: Any, vehicle: Vehicle, camera: str | None, sensors:
 
 
 def active_checks(listener: Any, arguments: argparse.Namespace, bound: float = checks.STOP_TIME) -> list[Check]:
-    """Arming, disarming, killing, the pilot's takeover and the watchdog, where the propellers are off.
-
-    `bound`: see `checks.check_watchdog`.
-    """
+    """Check arming, disarming, kill, the pilot's takeover and watchdog, with the props off; `bound`: see `checks.check_watchdog`."""
     if not arguments.props_off:
         return [Check(name, Verdict.OPEN, "the motors were not started", "take the propellers off, and add --props-off")
                 for name in ("armed state", "disarming", "kill", "pilot's takeover", "watchdog")]
@@ -106,7 +103,7 @@ def active_checks(listener: Any, arguments: argparse.Namespace, bound: float = c
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    """Listen, check, print."""
+    """Receive data, check them, and print the verdicts."""
     if not 1.0 <= arguments.listen <= 300.0:
         raise PerchError(f"--listen: {arguments.listen:g} is outside [1, 300] s")
     vehicle = load_vehicle(arguments.vehicle)

@@ -56,11 +56,11 @@ def certify(vehicle: Vehicle, times: np.ndarray, states: np.ndarray, rates: np.n
 
 def certify_end(times: np.ndarray, states: np.ndarray, perch: PerchPose, position: float, tilt_deg: float, speed: float
                 ) -> tuple[Certificate, ...]:
-    """Certificates of the errors of the last state against the wanted pose.
+    """Certificates of the errors of the last state against the required pose.
 
     Args:
         times, states: as in `certify`.
-        perch: wanted pose and velocity.
+        perch: required pose and velocity.
         position: greatest position error [m]; inf: any.
         tilt_deg: greatest angle between b3 and s3 [deg].
         speed: greatest velocity error [m/s].

@@ -43,7 +43,7 @@ class ProblemData:
 
     Attributes:
         start: x_init [P:eq14b], shape (17,).
-        reference: wanted end: p (3), s3 (3), v (3), w (3), shape (12,).
+        reference: required end: p (3), s3 (3), v (3), w (3), shape (12,).
         lines: rows of centre, direction, radius, half length, shape (lines, 8).
         run_weights: thrust, body rate, ramp, body rate between nodes, shape (4,); see `stage_functions`.
         end_weights: horizontal position, height, tilt, velocity, body rate, thrust, shape (6,).

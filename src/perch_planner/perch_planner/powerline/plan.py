@@ -79,7 +79,7 @@ class PowerlinePlan:
         Args:
             model: constants.
             start_time: stamp of the start [s].
-            step: wanted spacing of the samples [s]; 0: all, about 1 ms. Start, end and the joint are always included.
+            step: desired spacing of the samples [s]; 0: all, about 1 ms. Start, end and the joint are always included.
         """
         times: list[np.ndarray] = []
         states: list[np.ndarray] = []

@@ -15,12 +15,12 @@ E3 = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class PerchPose:
-    """Wanted end of a perch: pose with free yaw about b3, and velocity.
+    """Required end of a perch: pose with free yaw about b3, and velocity.
 
     Attributes:
         p_WB: position of the centre of mass [m], shape (3,).
-        s3_W: wanted direction of b3, unit, shape (3,).
-        v_W: wanted velocity [m/s], shape (3,).
+        s3_W: required direction of b3, unit, shape (3,).
+        v_W: required velocity [m/s], shape (3,).
     """
 
     p_WB: np.ndarray
@@ -56,7 +56,7 @@ class PerchPose:
             pitch: tilt about the line, in [0, pi] [rad].
             offset: from the wire's axis to the centre of mass along b3 [m].
             side_W: a point in W on the side that the vehicle comes from [m], shape (3,).
-            v_W: wanted velocity at the end [m/s].
+            v_W: required velocity at the end [m/s].
 
         Raises:
             PlanningRefusal: pitch out of range, not finite, or a vertical line.
@@ -79,7 +79,7 @@ class PowerlineRequest:
         start: state, shape (17,), see `rotor_model`.
         lines: all segments to avoid, the target among them.
         target_line: id of the segment to perch on.
-        perch: wanted end of the perch; None only with `recovery_only`.
+        perch: required end of the perch; None only with `recovery_only`.
         perception: keep the target line in view. [P:eq8-13]
         with_recovery: append the recovery. [P:V-B]
         recovery_only: plan a recovery from `start` alone.
