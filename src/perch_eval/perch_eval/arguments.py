@@ -1,4 +1,4 @@
-"""Command lines: how a program begins and ends, and what it takes: counts, folders for results, the address of the network."""
+"""Common parts of the command lines: parser, `main` with its exit codes, counts, output folders, network address."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _locked: dict[Path, int] = {}  # folder of results -> its open file, whose lock 
 
 
 def count(text: str) -> int:
-    """How many, at least one, for argparse."""
+    """Parse a count of at least one, for argparse."""
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not >= 1")
@@ -25,19 +25,19 @@ def count(text: str) -> int:
 
 
 def command_parser(name: str, description: str | None, examples: str) -> argparse.ArgumentParser:
-    """A command line with examples below its help, which stay as they are written."""
+    """Return a parser whose help shows the description and, below it, the examples verbatim."""
     return argparse.ArgumentParser(prog=name, description=description, epilog=examples, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argparse.Namespace], int], *mistakes: type[Exception],
             interrupted: str = "interrupted") -> Callable[..., int]:
-    """A program's `main`; it ends with what its work returns, 2 with one line where it is refused, 130 where it is interrupted.
+    """Return a program's `main`. Exit code: that of `work`; 2, with a one-line error, for a caller's mistake; 130 after Ctrl-C.
 
     Args:
-        parser: makes the command line.
-        work: what is done with its arguments.
-        mistakes: what else the caller is to blame for, beside `PerchError` and `OSError`.
-        interrupted: said after Ctrl-C.
+        parser: returns the command-line parser.
+        work: does the program's work with the parsed arguments and returns the exit code.
+        mistakes: exceptions that count as the caller's mistake, beside `PerchError` and `OSError`.
+        interrupted: message after Ctrl-C.
     """
     callers: tuple[type[Exception], ...] = (OSError, PerchError, *mistakes)
 
@@ -57,14 +57,14 @@ def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argpa
 
 
 def output_folder(path: Path, option: str = "--out") -> Path:
-    """Make a folder for results, which this process has to itself until it ends: nodes read their parameters there.
+    """Create an output folder and lock it until this process ends, as nodes read their parameters from it.
 
     Args:
         path: of the folder.
-        option: what the caller named it with, for the message.
+        option: command-line option that names the folder, for error messages.
 
     Raises:
-        ConfigError: it cannot be made, nothing can be written to it, or another process has it.
+        ConfigError: the folder cannot be created or written to, or another process has locked it.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -83,10 +83,10 @@ def output_folder(path: Path, option: str = "--out") -> Path:
 
 
 def open_network(address: str | None) -> None:
-    """Bind the ROS sockets of this process and its children to an address, instead of that of $PERCH_NETWORK (loopback by default).
+    """Bind the ROS sockets of this process and its children to an address; None: that of $PERCH_NETWORK, or else loopback.
 
     Raises:
-        ConfigError: no network of this machine has the address.
+        ConfigError: the address is not that of exactly one network of this machine.
     """
     source, address = ("--network", address) if address else ("PERCH_NETWORK", os.environ.get("PERCH_NETWORK", "127.0.0.1"))
     try:

@@ -1,4 +1,4 @@
-"""What the cameras saw around a perch: one looping animation (WebP) of all cameras side by side."""
+"""Camera images around a perch as a looping animation (WebP) of all cameras side by side."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PAUSE = 1.0   # on the last frame [s]
 
 
 def clip(flight: Flight) -> str:
-    """HTML of the animation at the speed of the flight; empty where no image was recorded."""
+    """Return the animation, at the speed of the flight, as HTML; empty if no image was recorded in the time shown."""
     recorded = {name: found for name in CAMERAS if (found := flight.values(f"camera_{name}/image_raw/compressed"))}
     if not recorded:
         return ""
@@ -41,7 +41,7 @@ def clip(flight: Flight) -> str:
 
 
 def _newest(images: list[tuple[float, CameraImage]], time: float) -> CameraImage:
-    """Of those until a time, or the first."""
+    """Return the newest image up to a time [s], or else the first one."""
     return next((image for t, image in reversed(images) if t <= time), images[0][1])
 
 

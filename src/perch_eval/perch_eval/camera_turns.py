@@ -1,4 +1,4 @@
-"""How a camera turns from frame to frame, told from its images alone; where it moves, too, the turn about its axis is hardly concerned by that."""
+"""Rotation of a camera between frames, from its images alone. Translation hardly affects the rotation about the optical axis."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def rotation_between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 class CameraTurns:
-    """Takes images; collects mean rates of the camera in C between two of them.
+    """Estimates the mean angular rate of a camera in C between consecutive images.
 
     Attributes:
         spans: (from, to) stamps [ns] and rates in C [rad/s], (3,).

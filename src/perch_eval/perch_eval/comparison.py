@@ -32,7 +32,7 @@ exit code: 0 written, 2 the caller's mistake (no such recording, nothing in it)"
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two flights: what was recorded, what its `report.json` and the recording say, and whether the vehicle is known."""
+    """One of the two flights: the recording, figures from it and from its `report.json`, and whether the vehicle is known."""
 
     view: FlightView
     report: dict[str, Any]
@@ -67,16 +67,16 @@ def _write(args: argparse.Namespace) -> int:
 
 
 def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str = "") -> Side:
-    """A recorded flight with its report, where there is one.
+    """Read a recorded flight and, if there is one, its report.
 
     Args:
         name, colour: on the page.
         path: of the recording, or of its folder.
         namespace: of the vehicle, where several were recorded.
-        vehicle: name or file; empty: as report or recording say.
+        vehicle: name or file; empty: that of the report or of the recording.
 
     Raises:
-        PerchError: no recording, or nothing in it.
+        PerchError: there is no recording or no true states in it, or report or vehicle cannot be used.
     """
     file = path / "flight.mcap" if path.is_dir() else path
     flight = opened(file, namespace)
@@ -93,7 +93,7 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
 
 
 def compare(a: Side, b: Side) -> str:
-    """The page."""
+    """Return the page as HTML."""
     sides, views = (a, b), (a.view, b.view)
     same = a.report["flight_hash"] == b.report["flight_hash"]
     verdict = "The two are the same flight, to the last bit." if same else "The two are different flights."

@@ -19,7 +19,7 @@ with quiet_on_interrupt():
 
 
 def main() -> None:
-    """Run the nodes of a plan until SIGINT or SIGTERM; exit code 2 where one refuses its parameters."""
+    """Run the nodes of a plan until SIGINT or SIGTERM; exit code 2 if the plan or the parameters of a node are refused."""
     if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
         print("usage: composed PLAN.json (start_stack.py --composed writes one)", file=sys.stderr)
         sys.exit(2)

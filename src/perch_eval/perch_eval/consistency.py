@@ -42,7 +42,7 @@ class Consistency:
         dimension: degrees of freedom of one sample.
         times: shape (m,) [s].
         mean: average over the runs at each time, shape (m,).
-        bounds: between which the average of a consistent filter lies with 95 % probability.
+        bounds: 95 % bounds of the average for a consistent filter.
         runs: number of runs.
     """
 
@@ -60,12 +60,12 @@ class Consistency:
 
     @property
     def above(self) -> float:
-        """Share of the time in which the filter is too sure of itself."""
+        """Share of the time in which the average exceeds its upper bound: the filter is overconfident."""
         return float(np.mean(self.mean > self.bounds[1]))
 
 
 def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int) -> Consistency:
-    """Average NEES or NIS samples over runs and set them against their 95 % bounds.
+    """Average NEES or NIS samples over runs and compare them with their 95 % bounds.
 
     Args:
         name: what was tested.
@@ -74,7 +74,7 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int) -> 
         dimension: degrees of freedom of one sample.
 
     Raises:
-        ValueError: shapes that do not belong together.
+        ValueError: the shapes do not match.
     """
     samples = np.asarray(samples, float)
     if samples.ndim != 2 or samples.shape[1] != len(times):
@@ -85,7 +85,7 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int) -> 
 
 
 def plot(results: list[Consistency], path: Path, marks: dict[str, float]) -> None:
-    """One panel per result: the average over the runs, its expectation and bounds, into an image file.
+    """Plot each result into an image file, one panel each: average over the runs, expectation and bounds.
 
     Args:
         results: what `judge` returned.

@@ -1,4 +1,4 @@
-"""Flies a scenario on the real nodes and reports it."""
+"""Fly a scenario on the real nodes and write a report."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
 
 def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FAST_NODES, realtime: bool = False,
         verbose: bool = False, vehicle: str = "") -> dict:
-    """Fly a scenario once; the report's content is returned and written to `out`.
+    """Fly a scenario once, write the report to `out` and return its content.
 
     Args:
         scenario_name: name in config/scenarios, or a file.
@@ -95,7 +95,7 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
 
 @contextmanager
 def _replaced(recording: Path) -> Iterator[None]:
-    """Put the recording of an earlier flight aside, as this one may end before it records; a caller's mistake puts it back."""
+    """Move an earlier recording aside, as this flight may end before it records; restore it after a `PerchError`."""
     aside = recording.with_suffix(".earlier")
     if recording.exists():
         recording.replace(aside)
@@ -110,7 +110,7 @@ def _replaced(recording: Path) -> Iterator[None]:
 
 
 def _flown(scenario: Scenario, stack: Stack) -> FlightResult:
-    """Send the goal to a started stack; a flight that breaks off is a result too, its recording is kept."""
+    """Send the goal to a started stack. An aborted flight is a result as well, unless a program refused its parameters."""
     with closing(MissionClient()) as client:
         try:
             stack.wait_until_ready(client.visible_nodes, timeout=READY_TIMEOUT)

@@ -1,4 +1,4 @@
-"""Reserves ROS domains, so that flights and tests on one machine never hear each other."""
+"""Reservation of ROS domains, which isolates flights and tests on one machine from each other."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from perch_core.ros.shared_memory import end_unfinished
 from perch_eval.shared_memory import ports
 
 USABLE = range(43, 102)
-"""Up to 101 the ports stay below Linux's ephemeral ones; 42 is the default of `setup.bash`, smaller ones are people's."""
+"""Ids up to 101 keep the ports below Linux's ephemeral ones; 42 is the default of `setup.bash`, smaller ids are left to users."""
 _given: list[int] = []
-"""The domains that this process was given, in order."""
+"""The domains that this process has reserved, in order."""
 
 
 @contextlib.contextmanager
 def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None = None) -> Iterator[int]:
-    """A domain id that no other reservation on this machine holds, and in which nobody takes part.
+    """Reserve a domain id that is not reserved on this machine and has no participants.
 
-    The kernel gives it back when the process ends, however it ends.
+    The kernel releases the reservation when the process ends, however it ends.
 
     Args:
         candidates: ids to choose from, best first; by default all usable ones.
-        folder: where the lock files lie; by default the machine's folder for temporary files.
+        folder: of the lock files; by default one in the machine's folder for temporary files.
 
     Raises:
         PerchError: every candidate is taken.
@@ -54,7 +54,7 @@ def reserved_domain(candidates: Iterable[int] | None = None, folder: Path | None
 
 @contextlib.contextmanager
 def own_domain(candidates: Iterable[int] | None = None) -> Iterator[int]:
-    """A `reserved_domain` that is this process's own meanwhile, and that of what it starts."""
+    """Reserve a domain and use it in this process and its children (ROS_DOMAIN_ID) until the context ends."""
     before = os.environ.get("ROS_DOMAIN_ID")
     try:
         with reserved_domain(candidates) as domain:
@@ -70,14 +70,14 @@ def participants(domain: int) -> list[int]:
 
 
 def free_domain() -> int:
-    """A domain id that this process keeps to itself until it ends."""
+    """Reserve a domain id until this process ends."""
     stack = contextlib.ExitStack()
     atexit.register(stack.close)
     return stack.enter_context(reserved_domain())
 
 
 def _spread() -> list[int]:
-    """The usable ids, from another one on in each process (people who choose by hand begin with the small ones), and after the
-    one given last: nodes that have been destroyed stay in the graph for a while."""
+    """Return the usable ids in the order to try: from the one after the last reserved, as destroyed nodes stay in the graph for a
+    while; at first from one that depends on the process, as users tend to choose small ones."""
     start = USABLE.index(_given[-1]) + 1 if _given and _given[-1] in USABLE else os.getpid() % len(USABLE)
     return [*USABLE[start:], *USABLE[:start]]

@@ -1,4 +1,4 @@
-"""Imported in a fork server before all else: it ends when its caller ends, however that happens, and what it has forked ends with it."""
+"""Imported first in a fork server: when its caller ends, in whatever way, the server is killed, and the forked nodes with it."""
 
 from __future__ import annotations
 

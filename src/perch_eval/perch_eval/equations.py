@@ -1,8 +1,8 @@
-"""The index of equations: where each equation of both papers is defined, read from the tags in docstrings.
+"""Write docs/equations.md, the index of where each equation of both papers is defined, from the tags in docstrings.
 
-`[defines M:eq15]` stands in the docstring of the one function or class that a reader changes to change the equation; a vehicle
-flies it: it is reached from a node's program by names and imports. Whatever else has to do with the equation carries `[uses M:eq15]`
-or `[M:eq15]`. A tag may name several: `[P:eq3-7]`, `[M:eq2,12,13]`, `[M:alg1]`; a letter (`[P:eq14h]`) names a row.
+`[defines M:eq15]` marks the one function or class that implements the equation: the place to change it. This code must be in use,
+that is, reachable from a node's program by names and imports. Other code related to it is tagged `[uses M:eq15]` or `[M:eq15]`.
+A tag may name several equations: `[P:eq3-7]`, `[M:eq2,12,13]`, `[M:alg1]`; a letter (`[P:eq14h]`) names a row.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ REASONS = {
     ("M", "eq18"): "what flies is decided by subdivision: in floating point the chain accepts polynomials that break their bound",
     ("M", "eq19"): "an example of (18)",
 }
-"""Equations whose definition does not fly, with the reason."""
+"""Equations whose definition is not used in flight, with the reason."""
 
 _ENTRY = "*_node.py"
 _TAG = re.compile(r"\[(?:defines |uses )?([MP]):((?:eq|alg)[^\]]*)\]")
@@ -53,7 +53,7 @@ _Key = tuple[str, str]
 
 @dataclass(frozen=True)
 class Place:
-    """A function or class (a module: its name is its file's) whose docstring defines an equation; `flies`: a program reaches it."""
+    """A definition of an equation: file, name of function, class or module, and whether a node's program reaches it (`flies`)."""
 
     file: str
     name: str
@@ -76,7 +76,7 @@ def equations_of(text: str) -> list[_Key]:
 
 
 class _Module:
-    """What a module defines at its top level, and the names that it imports, (module, name) or (module, "")."""
+    """The top-level definitions of a module, and its imported names as (module, name) or (module, "")."""
 
     def __init__(self, path: Path, name: str) -> None:
         self.path, self.tree = path, ast.parse(path.read_text())
@@ -96,7 +96,7 @@ class _Module:
 
 
 def _modules(root: Path) -> dict[str, _Module]:
-    """The packages' modules by dotted name."""
+    """Return the modules of the packages by dotted name."""
     out = {}
     for path in sorted((root / "src").glob("perch_*/perch_*/**/*.py")):
         name = ".".join(path.relative_to(root / "src").with_suffix("").parts[1:]).removesuffix(".__init__")
@@ -105,7 +105,7 @@ def _modules(root: Path) -> dict[str, _Module]:
 
 
 def _reached(modules: dict[str, _Module]) -> set[_Key]:
-    """(module, top-level name) of all that the programs of the nodes refer to, directly or through others; a class with all it has."""
+    """Return (module, top-level name) of all that the nodes' programs refer to, also indirectly; a class counts as a whole."""
     out: set[_Key] = set()
     todo = [(name, top) for name, module in modules.items() if module.path.match(_ENTRY) for top in module.defined]
     while todo:
@@ -130,7 +130,7 @@ def _reached(modules: dict[str, _Module]) -> set[_Key]:
 
 @lru_cache
 def definitions(root: Path) -> dict[_Key, list[Place]]:
-    """Where each equation is defined."""
+    """Return the places at which each equation is defined."""
     modules = _modules(root)
     found: dict[_Key, list[Place]] = {}
     reached = _reached(modules)
@@ -149,7 +149,7 @@ def definitions(root: Path) -> dict[_Key, list[Place]]:
 
 
 def problems(root: Path) -> list[str]:
-    """What is wrong with the index, one line each: no definition, two, or one that no program reaches."""
+    """Return the faults of the index, one line each: no definition, several, one that no program reaches, an unknown equation."""
     found, out = definitions(root), []
     for paper, titles in TITLES.items():
         for eq, title in titles.items():
@@ -188,7 +188,7 @@ def page(root: Path) -> str:
 
 
 def main() -> int:
-    """Write docs/equations.md; 1 where it has an equation without the one definition that flies."""
+    """Write docs/equations.md; return 1 if the index has faults, otherwise 0."""
     command_parser("equations.py", __doc__, EXAMPLES).parse_args()
     (root() / "docs" / "equations.md").write_text(page(root()))
     for line in (wrong := problems(root())):

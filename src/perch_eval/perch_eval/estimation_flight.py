@@ -1,7 +1,7 @@
-"""VIO and estimator on a true perch motion with rendered images: their components on the flight loop, without a controller.
+"""VIO and estimator components on the flight loop, with a prescribed motion and rendered images, without a controller.
 
-For benches, tests and Monte-Carlo runs of consistency: the images, the camera's calibration errors and the IMU are the
-simulator's, the motion is exact (`perch_motion`), and nothing of the truth reaches the estimators.
+For benchmarks, tests and Monte-Carlo runs of consistency. Images, camera calibration errors and IMU are the simulator's, the
+motion is exact (`perch_motion`). Of the truth, the estimators are given only a perturbed start pose.
 """
 
 from __future__ import annotations
@@ -46,24 +46,24 @@ class TrueMotion(Protocol):
 
     @property
     def duration(self) -> float:
-        """Of all of it [s]."""
+        """Total duration [s]."""
 
     def sample(self, times: np.ndarray) -> Motion:
-        """The state at times [s], shape (n,)."""
+        """Return the states at times [s], shape (n,)."""
 
 
 @dataclass(frozen=True)
 class Flight:
-    """A motion as the sensors saw it.
+    """Sensor data of a motion, with the truth.
 
     Attributes:
         motion: the true motion, at any time.
         truth: the true motion at the IMU's stamps.
         readings: of the IMU.
-        mount: the camera as calibrated, what VIO is told.
+        mount: the camera as calibrated, which VIO is given.
         frames: (middle of the exposure [s], stamp [ns], image), in order.
-        told_wrong: by how much position [m] and yaw [rad] are wrong that VIO is told at its start, shape (4,).
-        vehicle: name of its file.
+        told_wrong: error of the start position [m] and yaw [rad] that VIO is given, shape (4,).
+        vehicle: name of the vehicle file.
     """
 
     motion: TrueMotion
@@ -81,7 +81,7 @@ class Flight:
 
 
 def motion_of(scenario: Scenario, seed: int) -> PerchMotion:
-    """A motion that ends on the scenario's pad."""
+    """Return a perch motion that ends on the scenario's pad."""
     vehicle, target, surface = load_vehicle(scenario.vehicle), scenario.target, scenario.surface
     end = surface.p_WS + vehicle.perch_offset * surface.normal
     settings = PerchMotionConfig(
@@ -92,17 +92,17 @@ def motion_of(scenario: Scenario, seed: int) -> PerchMotion:
 
 
 def fly(scenario: Scenario, seed: int) -> Flight:
-    """Sensor data of a perch; calibration errors are drawn where the scenario's realism asks for them.
+    """Return sensor data of a perch; calibration errors of the camera are drawn unless the scenario's realism is `ideal`.
 
     Args:
         scenario: room, pad and realism; its target must lie straight ahead of the start.
-        seed: of everything.
+        seed: of every random number.
     """
     return seen(motion_of(scenario, seed), build_scene(scenario, seed), scenario, seed)
 
 
 def seen(motion: TrueMotion, scene: Scene, scenario: Scenario, seed: int) -> Flight:
-    """Sensor data of a motion in a scene, as `fly`; of the scenario vehicle and realism count."""
+    """Return sensor data of a motion in a scene, as `fly`; only vehicle and realism of the scenario are used."""
     vehicle = load_vehicle(scenario.vehicle)
     mount, rng = vehicle.mounts["down"], np.random.default_rng([seed, 7])
     real = mount if scenario.realism == "ideal" else true_mount(mount, rng)
@@ -124,7 +124,7 @@ class VioStep:
 
     Attributes:
         time: middle of the exposure [s].
-        result: what VIO said.
+        result: of VIO.
         cost: CPU time of the frame [s].
         error: truth minus estimate of (position, rotation about W's axes, velocity in B), shape (9,); None without a pose.
     """
@@ -136,14 +136,14 @@ class VioStep:
 
 
 class _Frame(CameraImage):
-    """An image that knows the middle of its exposure [s]."""
+    """An image with the middle of its exposure [s]."""
 
     __slots__ = ("middle",)
     middle: float
 
 
 class _Vehicle(Component[NoParameters]):
-    """A flight's sensors as the vehicle of a loop."""
+    """Replays the sensor data of a flight in place of a loop's vehicle."""
 
     config_type = NoParameters
 
@@ -164,7 +164,7 @@ class _Vehicle(Component[NoParameters]):
         return self._k >= len(self._flight.truth.times)
 
     def advance(self) -> list[Arrival]:
-        """The next sample, and the frames that have arrived by it."""
+        """Emit the next IMU sample and the frames due by then; return these frames' arrivals."""
         at = float(self._flight.truth.times[self._k])
         sample = self._flight.sample(self._k)
         self._k, self.time = self._k + 1, sample.stamp
@@ -184,14 +184,14 @@ class _Vehicle(Component[NoParameters]):
 
 
 class _Vio(VioComponent):
-    """Keeps what became of each frame, and what it cost."""
+    """VIO component that records result and processor time of each frame."""
 
     def __init__(self, config: VioComponentConfig) -> None:
         super().__init__(config)
         self.frames: list[tuple[float, VioResult, float]] = []  # middle of the exposure [s], result, CPU time [s]
 
     def use(self, image: CameraImage) -> None:
-        """As it does, and note it."""
+        """Process an image as the base class does; record result and processor time."""
         assert isinstance(image, _Frame)
         clock = time.process_time()
         super().use(image)
@@ -200,7 +200,7 @@ class _Vio(VioComponent):
 
 
 class _Repeated(Component[NoParameters]):
-    """VIO's states again, each with its frame."""
+    """Replays VIO's states, each when its frame arrives."""
 
     config_type = NoParameters
 
@@ -212,13 +212,13 @@ class _Repeated(Component[NoParameters]):
         self._states = states
 
     def on_frame(self, model: CameraModel) -> None:
-        """Of the frame with this stamp."""
+        """Emit the state of the frame with this stamp, if there is one."""
         if model.stamp in self._states:
             self.state(self._states[model.stamp])
 
 
 class _Estimator(StateEstimator):
-    """Keeps its whole state at every `STRIDE`-th sample from `begin` [s] on, and the NIS of each state that it has used."""
+    """Estimator that records its state at every `STRIDE`-th sample from `begin` [s] on, and the NIS of accepted VIO states."""
 
     def __init__(self, begin: float) -> None:
         super().__init__(UkfConfig())  # type: ignore[arg-type]  # the name of the estimator is nothing to itself
@@ -227,7 +227,7 @@ class _Estimator(StateEstimator):
         self.nis: list[float] = []
 
     def on_imu(self, sample: ImuSample) -> None:
-        """As it does, and note it."""
+        """Process a sample as the base class does; record NIS and state."""
         accepted = self._estimator.status.accepted
         super().on_imu(sample)
         if self._estimator.status.accepted > accepted:
@@ -239,11 +239,11 @@ class _Estimator(StateEstimator):
 
 
 def run_vio(flight: Flight, begin: float = 0.0, level_ground: bool = True) -> list[VioStep]:
-    """VIO over a flight; it is switched on at `begin` [s], and told the pose of that moment, as wrong as the flight has it.
+    """Run VIO over a flight, from `begin` [s] on. Its start pose is the true position at yaw 0, both with the error `told_wrong`.
 
     Args:
         flight: the sensor data.
-        begin: where it starts [s].
+        begin: start of VIO [s].
         level_ground: whether the vehicle stands on level ground at the start.
     """
     standing = flight.motion.sample(np.array([begin])).p_WB[0] - (0.0, 0.0, load_vehicle(flight.vehicle).standing_height)
@@ -272,14 +272,14 @@ def _vio_error(flight: Flight, result: VioResult) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class EstimatorTrack:
-    """The estimator along a flight, at n IMU stamps.
+    """Errors and covariances of the estimator along a flight, at n IMU stamps.
 
     Attributes:
         times: [s], shape (n,).
         errors: truth minus estimate of (p, v, theta, b_g, b_a), shape (n, 15).
         covariances: shape (n, 15, 15).
-        nis: of each state of VIO that was used.
-        health: what it told of itself, ten times a second.
+        nis: of each VIO state that was used.
+        health: the estimator's health messages, ten per second.
     """
 
     times: np.ndarray
@@ -290,7 +290,7 @@ class EstimatorTrack:
 
 
 def run_estimator(flight: Flight, steps: list[VioStep], latency: float = 0.040, begin: float = 0.7) -> EstimatorTrack:
-    """The estimator on a flight's IMU and on VIO's states, which count `latency` [s] after their exposure, or with the next sample."""
+    """Run the estimator on IMU samples and VIO states, each used `latency` [s] after its exposure, or with the next sample."""
     stamps = {middle: stamp for middle, stamp, _ in flight.frames}
     states = {stamps[s.time]: _state(s.result.estimate) for s in steps if s.result.estimate is not None and s.time in stamps}
     estimator, vehicle = _Estimator(begin), _Vehicle(flight, transport=min(TRANSPORT, latency))

@@ -1,4 +1,4 @@
-"""Packages that set-up leaves out until they are asked for (`requirements/extras`)."""
+"""Optional packages, which set-up installs only on request (`requirements/extras`)."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ MODULES = {"campaigns": ("distributed",), "recordings": ("evo", "rosbags"), "vie
 
 
 def require(extra: str) -> None:
-    """Refuse to go on without the packages of an extra.
+    """Check that the packages of an extra are installed.
 
     Raises:
-        PerchError: with the command that installs them.
+        PerchError: a package is missing; the message has the command that installs it.
     """
     missing = [module for module in MODULES[extra] if find_spec(module) is None]
     if missing:

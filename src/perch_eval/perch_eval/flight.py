@@ -30,11 +30,11 @@ class States:
     w: np.ndarray
 
     def chosen(self, rows: np.ndarray) -> States:
-        """Some of them, by a mask."""
+        """Return the states that a mask selects."""
         return States(self.t[rows], self.p[rows], self.q[rows], self.v[rows], self.w[rows])
 
     def covers(self, times: np.ndarray) -> np.ndarray:
-        """Which of these times lie neither outside the states nor in a gap between them, (n,)."""
+        """Return a mask of the times that lie within the states and not in a gap longer than `GAP`, shape (n,)."""
         right = np.clip(np.searchsorted(self.t, times), 1, len(self.t) - 1)
         return (times >= self.t[0]) & (times <= self.t[-1]) & (self.t[right] - self.t[right - 1] <= GAP)
 
@@ -51,7 +51,7 @@ def interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.nda
 
 
 def time_of(value: Any) -> float | None:
-    """The time that a value is of [s]: its stamp, of a trajectory its start; None: it has none."""
+    """Return the time of a value [s]: its stamp, or the start of a trajectory; None if it has neither."""
     if isinstance(value, TrajectoryOrder):
         return value.trajectory.start_time
     stamp = getattr(value, "stamp", None)
@@ -67,7 +67,7 @@ class Flight:
     """The values of one flight by channel, without leading slash.
 
     Attributes:
-        source: what it is, or its recording, for messages.
+        source: description of the flight, or its recording, for messages.
         damage: why the recording could not be read to its end; empty if it could.
     """
 
@@ -89,15 +89,15 @@ class Flight:
         return sorted(self._channels)
 
     def states(self, channel: str) -> States | None:
-        """The states of a channel of odometry, in the order of their stamps."""
+        """Return the states of an odometry channel in the order of their stamps; None if there are fewer than two."""
         found: list[OdometryState] = sorted((value for _, value in self.values(channel)), key=lambda state: state.stamp)
         return _states(found, "p_WB", "q_WB", "v_WB", "w_B")
 
     def known_states(self, channel: str) -> States:
-        """As `states`, where the flight must have them.
+        """Return `states` of a channel that must have them.
 
         Raises:
-            PerchError: it has not.
+            PerchError: the channel has fewer than two states.
         """
         found = self.states(channel)
         if found is None:
@@ -110,7 +110,7 @@ class Flight:
         return np.array([t for t, _ in rows]), np.array([pick(value) for _, value in rows])
 
     def reference(self) -> States | None:
-        """What the controller wanted at each step while it followed a trajectory."""
+        """Return the controller's reference at each step of its trajectories; None if there are fewer than two."""
         found: list[ControlReference] = [value for _, value in self.values("controller/reference")]
         return _states(found, "p", "q", "v", "w")
 
@@ -126,7 +126,7 @@ class Flight:
 
 
 def _states(found: Sequence[Any], *names: str) -> States | None:
-    """Of values with a stamp and these four fields; None: too few."""
+    """Return `States` of values with a stamp and these four fields; None if there are fewer than two."""
     if len(found) < 2:
         return None
     stamps = np.array([value.stamp for value in found], dtype=np.int64)

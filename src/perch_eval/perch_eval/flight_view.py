@@ -1,4 +1,4 @@
-"""A flight as it is shown, alone or beside others: states, place, camera images, and the time of the perch."""
+"""Data of a flight for display, alone or beside others: states, surroundings, camera images, time of the perch."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ SQUARE = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
 
 @dataclass(frozen=True)
 class FlightView:
-    """What is shown of a flight.
+    """Data of a flight for display.
 
     Attributes:
-        name, colour: on a page with several flights.
-        flight, vehicle: what was recorded, and what flew.
+        name, colour: to distinguish several flights on a page.
+        flight, vehicle: the recording, and the vehicle that flew.
         truth: true states.
-        estimate, reference: estimated and wanted states, where recorded.
+        estimate, reference: estimated and reference states, where recorded.
         pad: true pose of the pad p (3,), R (3, 3), where there is one.
         cables: end points of mapped wires, (n, 2, 3).
         camera: (time [s], image) of the front camera's images.
@@ -47,10 +47,10 @@ class FlightView:
 
     @classmethod
     def of(cls, flight: Flight, vehicle: Vehicle, name: str = "", colour: str = TRUTH) -> FlightView:
-        """What a recording holds.
+        """Collect the data of a recording.
 
         Raises:
-            PerchError: no true states.
+            PerchError: the recording has no true states.
         """
         truth, pad = flight.known_states("ground_truth/odometry"), None
         if targets := flight.values("ground_truth/target"):
@@ -62,10 +62,10 @@ class FlightView:
                    flight.values("camera_front/image_raw/compressed"), *window)
 
     def around(self, before: float, after: float) -> tuple[float, float]:
-        """The perch with some time before and after it, as far as it is recorded [s]."""
+        """Return the time span of the perch with margins before and after it, as far as it is recorded [s]."""
         return max(float(self.truth.t[0]), self.start - before), min(float(self.truth.t[-1]), self.end + after)
 
     @property
     def pad_corners(self) -> np.ndarray | None:
-        """Of the pad in W [m], shape (4, 3)."""
+        """Corners of the pad in W [m], shape (4, 3); None if there is no pad."""
         return None if self.pad is None else self.pad[0] + PAD * SQUARE @ self.pad[1][:, :2].T

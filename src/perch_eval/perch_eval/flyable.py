@@ -1,4 +1,4 @@
-"""Refuses, before any node is started, a scenario that the nodes would refuse or that no flight could succeed in."""
+"""Checks, before any node is started, that the nodes accept a scenario and that a flight of it can succeed."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from perch_core.vehicle import Vehicle, load_vehicle
 from perch_sim.scenario import Scenario
 
 STEEPEST_VIEW = 80.0
-"""Between line of sight and the pad's normal [deg]; beyond, a 0.16 m tag at 1.7 m is 4 px wide."""
+"""Largest angle between line of sight and pad normal [deg]; beyond it, a 0.16 m tag at 1.7 m is 4 px wide."""
 
 
 def check_names(scenario: Scenario, source: str | Path) -> Vehicle:
-    """The scenario's vehicle, after making sure that everything the scenario names exists.
+    """Check that everything the scenario names exists, and return its vehicle.
 
     Args:
         scenario: to be checked.
@@ -37,15 +37,15 @@ def check_names(scenario: Scenario, source: str | Path) -> Vehicle:
 
 
 def check_flight(scenario: Scenario, source: str | Path, vehicle: Vehicle | None = None) -> None:
-    """Make sure that a flight of the scenario can begin and that its pad can be seen from the search hover.
+    """Check that a flight of the scenario can begin and that its pad is visible from the search hover.
 
     Args:
         scenario: to be checked.
         source: its file, for messages.
-        vehicle: what `check_names` has found.
+        vehicle: as returned by `check_names`; None: that is called here.
 
     Raises:
-        ConfigError: with the value, its place and what is allowed.
+        ConfigError: the scenario is refused; the message has the value, its key and the allowed range.
     """
     vehicle = vehicle or check_names(scenario, source)
     for node in ("vehicle", "estimator", "controller", "mission"):
@@ -56,7 +56,7 @@ def check_flight(scenario: Scenario, source: str | Path, vehicle: Vehicle | None
 
 
 def _check_view(scenario: Scenario, source: str, vehicle: Vehicle) -> None:
-    """The pad must appear in the front camera's image, and not from behind."""
+    """Check that the pad is in the front camera's image, and seen neither from behind nor too obliquely."""
     mount = vehicle.mounts.get("front")
     if mount is None:
         raise ConfigError(source, "vehicle", f"{scenario.vehicle!r} has no camera 'front', which finds the pad")

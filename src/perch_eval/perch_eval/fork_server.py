@@ -1,7 +1,7 @@
-"""Starts nodes in a tenth of a second: each process is forked from one that has loaded their code. Knows nothing of ROS.
+"""Start of nodes in a tenth of a second, by forking each from a process that has loaded their code. Independent of ROS.
 
-A node's own start takes seconds of processor time for imports and compiled code, campaigns over ROS start thousands. What is forked, by
-the fork server of `multiprocessing`, is a process of its own: its own session, sockets, shared memory, signals and log.
+An ordinary start takes seconds of processor time for imports and compiled code, and campaigns over ROS start thousands of nodes.
+The fork server of `multiprocessing` forks each node into a process with its own session, sockets, shared memory, signals and log.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from perch_core.registry import resolved
 
 
 def start(what: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str], preload: str) -> int:
-    """Start a node, which ends with this process.
+    """Start a node, which is killed when this process ends.
 
     Args:
         what: `module:name` of something with `main()`, or of a function.
-        arguments: of its command line.
-        log: receives what it writes.
-        environment: on top of the caller's.
-        preload: module that is loaded before this process starts its first node.
+        arguments: of the node's command line.
+        log: file that receives its output.
+        environment: variables in addition to the caller's.
+        preload: module that the fork server loads before the first node is started.
 
     Returns:
-        Its process id, which leads a session of its own.
+        Process id of the node, which is also the id of its session.
 
     Raises:
-        PerchError: the process that forks has ended.
+        PerchError: the fork server has ended.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["perch_eval.ended_with_caller", preload])
@@ -48,7 +48,7 @@ def start(what: str, arguments: Sequence[str], log: Path, environment: Mapping[s
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs, or is stopped."""
+    """Return whether a process exists and has not ended; a stopped one counts as alive."""
     with suppress(psutil.NoSuchProcess):
         return psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
     return False
@@ -65,7 +65,7 @@ def session(leader: int) -> list[int]:
 
 
 def _become(what: str, arguments: tuple[str, ...], log: Path, environment: dict[str, str]) -> None:
-    """Be the node."""
+    """Turn the forked process into the node and run it."""
     os.setsid()
     end_with_parent(signal.SIGKILL)
     caller = multiprocessing.parent_process()

@@ -1,4 +1,4 @@
-"""What a scenario asks of the mission, and how a flight may end."""
+"""The mission goal of a scenario, and the possible outcomes of a flight."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from perch_sim.scenario import Scenario
 OUTCOMES = {int(result): result.name.lower() for result in Result}
 """Error code of the Perch action's result -> outcome."""
 SUCCESSES = ("perched", "inspected")
-"""Outcomes of a flight that did what was asked."""
+"""Outcomes of a successful flight."""
 
 
 def goal_of(scenario: Scenario) -> PerchGoal:
-    """The goal that a scenario's mission part describes."""
+    """Return the goal that a scenario's mission section describes."""
     mission = scenario.mission
     points = {"powerline": mission.perch_point, "inspection": scenario.inspection.watched}
     return PerchGoal(
@@ -25,6 +25,6 @@ def goal_of(scenario: Scenario) -> PerchGoal:
 
 
 def outcome_of(error_code: int, scenario: Scenario) -> str:
-    """The outcome of a goal that ended with a result's error code."""
+    """Return the outcome of a goal from the error code of its result."""
     outcome = OUTCOMES.get(error_code, "failed")
     return "inspected" if outcome == "perched" and scenario.mode == "inspection" else outcome

@@ -1,4 +1,4 @@
-"""docs/limits.md: what may enter, from the declarations beside the values, the topics and the ports."""
+"""Write docs/limits.md, the limits of all inputs, from the declarations of values, topics and ports."""
 
 from __future__ import annotations
 

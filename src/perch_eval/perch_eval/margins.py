@@ -1,4 +1,4 @@
-"""How much was missing until a flight would have failed: each figure with the limits that it has to keep."""
+"""Margins of a flight to failure: figures with the limits that they must keep."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Margin:
     """A figure of a flight and its limits.
 
     Attributes:
-        name: what it is.
+        name: of the figure.
         value: in `unit`.
-        low, high: limits; infinite where there is none.
+        low, high: limits; infinite if there is none.
         unit: of all three.
     """
 
@@ -34,11 +34,11 @@ class Margin:
 
     @property
     def left(self) -> float:
-        """Distance to the nearer limit, in `unit`; negative where it is not kept."""
+        """Distance to the nearer limit, in `unit`; negative if it is violated."""
         return min(self.value - self.low, self.high - self.value)
 
     def mapping(self) -> dict[str, Any]:
-        """For `report.json`."""
+        """Return the margin as a mapping for `report.json`."""
         return {"name": self.name, "value": self.value, "low": self.low, "high": self.high, "unit": self.unit, "left": self.left}
 
 
@@ -48,7 +48,7 @@ def number(value: float, sign: str = "") -> str:
 
 
 def limits(margin: dict[str, Any]) -> str:
-    """The limits of a mapped margin in words, without the unit; null, as JSON has it, is no limit."""
+    """Return the limits of a mapped margin in words, without the unit; None, as read from JSON, is no limit."""
     low, high = (None if limit is None or math.isinf(limit) else number(limit) for limit in (margin["low"], margin["high"]))
     return f"at least {low}" if high is None else f"at most {high}" if low is None else f"{low} to {high}"
 
@@ -60,12 +60,12 @@ def in_words(margin: dict[str, Any]) -> str:
 
 
 def margins(flight: Flight, vehicle: Vehicle, scenario: Scenario | None = None) -> list[Margin]:
-    """The margins of a perch, from the truth.
+    """Return the margins of a perch, from the truth.
 
     Args:
-        flight: what was recorded.
-        vehicle: its rotors, and the body rate that a plan may ask for.
-        scenario: what adhesion or gripper hold; without it nothing is said of the contact.
+        flight: the recording.
+        vehicle: its thrust limits, and the body rate limit of plans.
+        scenario: its limits of adhesion or gripper; None: no margins at contact.
     """
     return [*_in_flight(flight, vehicle), *(_at_contact(flight, scenario) if scenario is not None else ())]
 

@@ -25,7 +25,7 @@ class Schema(NamedTuple):
 
 
 class McapLog:
-    """Writes serialised messages to a file that stays readable when the process is killed or the disk is full, but for the last chunk."""
+    """Writes serialised messages to a file. If the process is killed or the disk is full, all but the last chunk is readable."""
 
     def __init__(self, path: Path) -> None:
         """
@@ -39,7 +39,7 @@ class McapLog:
         self._channels: dict[str, int] = {}
 
     def write(self, topic: str, schema: Schema, data: bytes, time: int) -> None:
-        """Append one message of a topic, whose first one declares its type; `time` is simulation time [ns].
+        """Append one message of a topic; the first one declares the topic's type. `time` is simulation time [ns].
 
         Raises:
             OSError: the disk is full, or gone.
@@ -71,27 +71,27 @@ class McapLog:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close the file without its index: what reached the disk stays readable."""
+        """Close the file without its index; what has reached the disk stays readable."""
         with suppress(OSError):
             self._file.close()
 
 
 def read(path: Path, on_damage: Callable[[str], None] = lambda _: None) -> Iterator[tuple[str, str, int, bytes]]:
-    """Messages of a file in the order written: topic, type, time [ns], data.
+    """Yield the messages of a file in the order written: topic, type, time [ns], data.
 
-    A cut-off or damaged file is read as far as it goes; a flight that broke off before its first message has no file at all.
-    Checksums are looked at: a decompressor makes something of nearly every damage.
+    A truncated or damaged file is read as far as possible; a missing one, as of a flight aborted at its start, has no messages.
+    Checksums are verified, as a decompressor accepts nearly all damaged data.
 
     Args:
         path: the file.
-        on_damage: told why a file could not be read to its end.
+        on_damage: called with the reason if the file cannot be read to its end.
     """
     for schema, channel, message in _read(path, on_damage):
         yield channel.topic, schema.name if schema else "", message.log_time, message.data
 
 
 def broke_off(path: Path) -> bool:
-    """Whether a file has no end: its writer was killed, the disk was full, or only a part of it was copied.
+    """Return whether a file lacks its end: the writer was killed, the disk was full, or the copy is incomplete.
 
     Raises:
         OSError: it cannot be read.
@@ -103,10 +103,10 @@ def broke_off(path: Path) -> bool:
 
 
 def make_whole(path: Path, copy: Path) -> str:
-    """Write what can be read of a file to another one, with an index.
+    """Copy the readable messages of a file to another one that has an index.
 
     Returns:
-        Why it could not be read to its end.
+        Reason why the file could not be read to its end.
 
     Raises:
         OSError: the copy cannot be written.
@@ -129,7 +129,7 @@ def make_whole(path: Path, copy: Path) -> str:
 
 
 def _read(path: Path, on_damage: Callable[[str], None]) -> Iterator[tuple[mcap.records.Schema | None, mcap.records.Channel, mcap.records.Message]]:
-    """As `read`, as the library's records."""
+    """Like `read`, but yields the library's records."""
     if not path.exists():
         return
     with open(path, "rb") as file:

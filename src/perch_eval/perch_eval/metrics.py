@@ -1,4 +1,4 @@
-"""The figures of a flight: what `report.json` holds."""
+"""The figures of a flight in `report.json`."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ FIGURES: dict[str, tuple[str, str, float]] = {
     "contact_tilt_error_deg": ("tilt error at contact", "deg", 1.0), "contact_offset_m": ("offset at contact", "cm", 100.0),
     "target_error_position_m": ("target error, position", "cm", 100.0), "target_error_attitude_deg": ("target error, attitude", "deg", 1.0),
 }
-"""Figure of a flight, as `figures` names it -> what it is, unit in which it is shown, factor to that unit."""
+"""Name of a figure, as in `figures` -> title, display unit, factor to that unit."""
 DURATION = re.compile(r"_(ms|us)(?=_|$)")
-"""In names of diagnostics that are durations."""
+"""Unit in the names of diagnostics that are durations."""
 
 
 def _rmse(difference: np.ndarray) -> list[float]:
@@ -35,9 +35,10 @@ def _rmse(difference: np.ndarray) -> list[float]:
 
 
 def perch_window(flight: Flight) -> tuple[float, float] | None:
-    """Start and end [s] of the perch: the first plan of the attempt that touched, or else of the last, up to contact or planned end.
+    """Return start and end of the perch [s]; None if none was planned.
 
-    A plan that begins after the planned contact of the one before is a new attempt; one before it replaces the one that is flown.
+    It is the attempt that made contact, or else the last one, until contact or planned end. A plan that begins after the planned
+    contact of the previous one is a new attempt; one that begins earlier replaces it.
     """
     plans = [(begin, begin + order.contact_after) for begin, order in flight.values("trajectory") if order.contact_after is not None]
     if not plans:
@@ -76,7 +77,7 @@ def contact_report(flight: Flight) -> dict[str, Any] | None:
 
 
 def peak_acceleration(truth: States) -> float:
-    """Largest acceleration of the vehicle's path, over 20 ms [m/s^2]."""
+    """Return the largest acceleration of the vehicle's path, averaged over 20 ms [m/s^2]."""
     if len(truth.t) < 12:
         return math.nan
     step = 10
@@ -86,7 +87,7 @@ def peak_acceleration(truth: States) -> float:
 
 
 def flight_metrics(flight: Flight, until: float) -> dict[str, Any]:
-    """Tracking, estimation, rates, contact and timings of a flight.
+    """Return the figures of tracking, estimation, motion, contact and target of a flight.
 
     Args:
         flight: the recording.
@@ -124,7 +125,7 @@ def flight_metrics(flight: Flight, until: float) -> dict[str, Any]:
 
 
 def figures(report: dict[str, Any], end_time: float) -> dict[str, float | None]:
-    """The figures of a flight's report that are compared, by name; None where one could not be had."""
+    """Return the comparable figures of a flight's report by name; None for one that is not available."""
     out: dict[str, float | None] = {"simulated_time_s": end_time, "attitude_error_at_end_deg": report.get("attitude_error_at_end_deg")}
     perch = bool(report.get("perch_planned"))  # else these are of a hover
     out |= {name: report.get(name) for name in ("max_body_rate_deg_s", "max_acceleration_m_s2") if perch}
@@ -141,7 +142,7 @@ def figures(report: dict[str, Any], end_time: float) -> dict[str, float | None]:
 
 
 def target_error(flight: Flight) -> dict[str, float] | None:
-    """Error of the target that the perch was planned on, in map."""
+    """Return the error, in map, of the target pose on which the first perch was planned; None if not available."""
     true, found = flight.values("ground_truth/target"), flight.values("target/pose")
     plans = [t for t, order in flight.values("trajectory") if order.at_end == AtEnd.CONTACT]
     if not true or not found or not plans:
@@ -178,7 +179,7 @@ def rates(flight: Flight) -> dict[str, float]:
 
 
 def diagnostics(flight: Flight) -> dict[str, list[dict[str, float]]]:
-    """Every diagnostics of each node, in order: their numbers by name."""
+    """Return the numeric values, by name, of all diagnostics of each node, in order."""
     out: dict[str, list[dict[str, float]]] = {}
     for _, said in flight.values("diagnostics"):
         values = {}
@@ -190,10 +191,10 @@ def diagnostics(flight: Flight) -> dict[str, list[dict[str, float]]]:
 
 
 def node_durations(flight: Flight) -> dict[str, dict[str, float]]:
-    """What the nodes measured of themselves in `_ms` and `_us`, over the whole flight [ms].
+    """Return the durations that the nodes report in `_ms` and `_us`, over the whole flight [ms].
 
     A node reports about once per second: each figure is the median of its reports, so that the first second, in which
-    compiled functions are loaded, does not hide the others.
+    compiled functions are loaded, does not dominate.
     """
     out: dict[str, dict[str, float]] = {}
     for node, reports in diagnostics(flight).items():
@@ -209,7 +210,7 @@ def node_durations(flight: Flight) -> dict[str, dict[str, float]]:
 
 
 def missed_deadlines(flight: Flight) -> dict[str, dict[str, float]]:
-    """In real time: how many deadlines each node of the loop had, how many it missed, and their share [%]; empty in lockstep."""
+    """Return number of deadlines, missed deadlines and their share [%] of each node in real time; empty in lockstep."""
     out: dict[str, dict[str, float]] = {}
     for node, reports in diagnostics(flight).items():
         counts = [values for values in reports if values.get("deadlines", 0.0) > 0.0]

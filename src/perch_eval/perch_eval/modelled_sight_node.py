@@ -1,5 +1,5 @@
-"""The nodes `target_localizer` and `powerline_mapper` without images: what they see is made from the truth, by the error models of
-flights in process. For campaigns over ROS that do not render.
+"""The nodes `target_localizer` and `powerline_mapper` without images: detections are generated from the truth by the error models
+of in-process flights. For campaigns over ROS without rendering.
 
     python3 -m perch_eval.modelled_sight_node target_localizer --ros-args -p scenario:=surface_90 -p seed:=3
 """
@@ -31,14 +31,14 @@ MEMORY = 1000  # true states kept: 2 s, as images wait for the odometry
 
 @dataclass(frozen=True)
 class SightParameters(TargetLocalizerConfig):
-    """Those of the localiser, and whose truth it looks at."""
+    """Parameters of the localiser, and scenario and seed of the truth."""
 
     scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file")
     seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
 
 
 class ModelledLocalizer(TargetLocalizer):
-    """The target localiser with its sightings made from the truth: a frame's `camera_info` takes the place of its image."""
+    """Target localiser whose sightings are generated from the truth; a frame's `camera_info` replaces its image."""
 
     config_type = SightParameters
 
@@ -59,19 +59,19 @@ class ModelledLocalizer(TargetLocalizer):
         return f"camera_{self.config.camera}/camera_info"
 
     def on_truth(self, state: OdometryState) -> None:
-        """A true state; frames may have waited for it."""
+        """Add a true state, and process frames that waited for it."""
         if state.stamp > self._newest:
             self._newest = state.stamp
             self._truth.append(TrueState(state.stamp, np.array((*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B))))
         self.advance()
 
     def on_camera_info(self, model: CameraModel) -> None:
-        """A frame."""
+        """Process a frame as an image without pixels."""
         super().on_camera_info(model)
         self.on_image(CameraImage(model.stamp, model.frame, model.camera.width, model.camera.height, "mono8", lambda *_: None))
 
     def covers(self, image: CameraImage) -> bool:
-        """As of an image, and the truth has passed its exposure, too."""
+        """As in the base class, and additionally whether the truth has passed the exposure."""
         return super().covers(image) and self._sight.middle(self._exposed(image)) <= self._newest
 
 
@@ -83,13 +83,13 @@ MODULE = "perch_eval.modelled_sight_node"
 
 def blind_launches(scenario: Scenario, seed: int, source: str, lockstep: bool, extra: Sequence[str] = (), **options: Any
                    ) -> tuple[NodeLaunch, ...]:
-    """The nodes that fly a scenario without images, with their parameters.
+    """Return the nodes that fly a scenario without images, with their parameters.
 
     Args:
-        scenario, seed, source: what is flown, its random numbers, its name or file.
+        scenario, seed, source: the scenario, seed of the random numbers, name or file of the scenario.
         lockstep: as in `node_launch.node_launches`.
         extra: nodes beside those of the scenario.
-        options: further ones of `node_launch.node_launches`.
+        options: further arguments of `node_launch.node_launches`.
     """
     nodes = ["vio_model" if name == "vio" else name for name in choose_nodes(scenario, extra=extra)]
     own: dict[str, Any] = {"scenario": source, "seed": seed}
@@ -99,7 +99,7 @@ def blind_launches(scenario: Scenario, seed: int, source: str, lockstep: bool, e
 
 
 def blind_programs(programs: Sequence[Program]) -> tuple[Program, ...]:
-    """Programs whose nodes that look at images are those of this module."""
+    """Return the programs with their image-processing nodes replaced by those of this module."""
     return tuple(Program(one.name, (sys.executable, "-m", MODULE, one.name, *one.command[1:]), one.nodes) if one.name in NODES else one
                  for one in programs)
 

@@ -1,8 +1,8 @@
-"""From a scenario to the nodes to start and their parameters.
+"""The nodes to start for a scenario, and their parameters.
 
-A node's parameters come, each over the one before, from `config/<node>.yaml`, from what the scenario as a whole says
-(vehicle, seed, who takes part), from the scenario's `parameters`, and from the caller's overrides. The result is
-written into one file per node, which is all that the node gets: so a log folder shows what was flown with.
+A node's parameters come from `config/<node>.yaml`, from the scenario as a whole (vehicle, seed, lockstep participants),
+from the scenario's `parameters`, and from the caller's overrides; later ones take precedence. The result is written into
+one file per node, the only source of its parameters, so that the log folder documents the flight.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ALWAYS = ("description",)
 """Nodes that are started with every scenario."""
 PATIENT = 60.0  # wall-clock limit of a plan for which simulation time waits [s]
 HOST_PARAMETERS = ("lockstep", "lockstep_hold", "use_sim_time")
-"""Parameters of a node that its component knows nothing of."""
+"""Parameters of a node's host; they are not passed to its component."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class NodeLaunch:
 
     Attributes:
         name: node and executable.
-        parameters: of its component, parameter -> value, nested or dotted.
-        host: of its host, see `HOST_PARAMETERS`.
+        parameters: of the component, parameter -> value, nested or dotted.
+        host: parameters of the host, see `HOST_PARAMETERS`.
     """
 
     name: str
@@ -44,7 +44,7 @@ class NodeLaunch:
 
     @property
     def package(self) -> str:
-        """Its package."""
+        """Package of the node."""
         return NODES[self.name]
 
     @property
@@ -62,7 +62,7 @@ class NodeLaunch:
 
 def choose_nodes(scenario: Scenario, only: Sequence[str] = (), without: Sequence[str] = (),
                  extra: Sequence[str] = ()) -> tuple[str, ...]:
-    """The nodes to start.
+    """Return the nodes to start.
 
     Args:
         scenario: names the nodes that are started by default.
@@ -71,7 +71,7 @@ def choose_nodes(scenario: Scenario, only: Sequence[str] = (), without: Sequence
         extra: start these too.
 
     Raises:
-        PerchError: a node that does not exist, or that would not have been started anyway.
+        PerchError: a node does not exist, one to leave out would not be started anyway, or none is left.
     """
     for node in (*only, *without, *extra):
         if node not in NODES:
@@ -88,18 +88,18 @@ def choose_nodes(scenario: Scenario, only: Sequence[str] = (), without: Sequence
 
 def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, scenario_source: str = "",
                   lockstep: bool = True, overrides: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[NodeLaunch, ...]:
-    """The nodes with their parameters.
+    """Return the nodes with their parameters.
 
     Args:
         scenario: what is flown.
-        nodes: what to start.
+        nodes: to start.
         seed: of every random number in the flight.
         scenario_source: name or file of the scenario, for the nodes that read it themselves.
-        lockstep: simulation time waits for all who take part; otherwise the wall clock paces it.
-        overrides: node -> parameter -> value, over everything else.
+        lockstep: simulation time waits for all participants; otherwise the wall clock paces it.
+        overrides: node -> parameter -> value; they take precedence over everything else.
 
     Raises:
-        ConfigError: a parameter file is no parameter file.
+        ConfigError: a parameter file is malformed.
         PerchError: an override for a node that is not started.
     """
     overrides = overrides or {}
@@ -117,10 +117,10 @@ def node_launches(scenario: Scenario, nodes: Sequence[str], *, seed: int = 1, sc
 
 
 def read_parameters(node: str) -> dict[str, Any]:
-    """The parameters of `config/<node>.yaml`; none where there is no such file.
+    """Return the parameters of `config/<node>.yaml`; none if there is no such file.
 
     Raises:
-        ConfigError: anything else than `/**: ros__parameters:` in it.
+        ConfigError: the file holds anything other than `/**: ros__parameters:`.
     """
     file = config.config_dir() / f"{node}.yaml"
     try:
@@ -131,10 +131,10 @@ def read_parameters(node: str) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=32)
 def parameters_in(file: Path, changed: int) -> dict[str, Any]:
-    """What a parameter file that was changed at a time [ns] sets in every namespace.
+    """Return the parameters that a file sets in every namespace; `changed` is its modification time [ns], a key of the cache.
 
     Raises:
-        ConfigError: anything else than `/**: ros__parameters:` in it.
+        ConfigError: the file holds anything other than `/**: ros__parameters:`.
     """
     content = config.read_yaml(file)
     if not isinstance(content, dict) or set(content) != {"/**"}:
@@ -149,7 +149,7 @@ def parameters_in(file: Path, changed: int) -> dict[str, Any]:
 
 
 def parse_overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Several `node.parameter:=value`, with values in YAML, as node -> parameter -> value; of two for the same, the later counts.
+    """Parse `node.parameter:=value` texts, with values in YAML, to node -> parameter -> value; later ones take precedence.
 
     Raises:
         PerchError: a text of another form.
@@ -165,14 +165,14 @@ def parse_overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def _host_parameters(node: str, lockstep: bool) -> dict[str, Any]:
-    """What the simulator means for a node's host. Its time is that of `/clock`, which the vehicle publishes, in real time, too."""
+    """Return a node's host parameters in simulation. Time is that of `/clock`, which the vehicle publishes, also in real time."""
     if node == "vehicle":
         return {"lockstep": lockstep, "use_sim_time": False}
     return {"lockstep": lockstep, "use_sim_time": True} if node in PARTICIPANTS else {"use_sim_time": True}
 
 
 def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, source: str, lockstep: bool) -> dict[str, dict[str, Any]]:
-    """What the scenario as a whole means for single nodes."""
+    """Return the parameters of each node that follow from the scenario as a whole."""
     participants = [node for node in nodes if node in PARTICIPANTS]
     vehicle = {"vehicle": scenario.vehicle}
     mission: dict[str, Any] = {"mission.planner_latency": scenario.latency.perching_planner,

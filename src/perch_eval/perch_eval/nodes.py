@@ -1,4 +1,4 @@
-"""From a scenario to the programs that a Stack can start: one per node, and one for the nodes that share a process."""
+"""The programs of a scenario for a `Stack`: one per node, and one for the nodes that share a process."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from perch_sim.scenario import NODES, Scenario
 
 ALL_NODES = tuple(NODES)
 CHAIN_NODES = ("vehicle", "estimator", "controller", "description")
-"""Nodes that every step waits for, and one that says where the vehicle is: in real time they share a process, and nobody else does."""
+"""Nodes that every step waits for, and the one that publishes the transforms: in real time only these share a process."""
 FAST_NODES = (*CHAIN_NODES, "mission", "recorder")
-"""Nodes with a little to do at many steps: between processes their messages cost more than their work."""
+"""Nodes with little work at many steps: messages between processes would cost more than this work."""
 PER_VEHICLE = ("/clock", "/tf", "/tf_static")
-"""Topics with absolute names of which each vehicle in a namespace has its own: simulated vehicles have times of their own, and the same frames."""
+"""Absolute topics that are remapped into a vehicle's namespace: simulated vehicles have separate clocks and equal frame names."""
 
 
 def sharing(names: Collection[str] | None, otherwise: Collection[str] = ()) -> Collection[str]:
-    """Nodes that share a process by the option `--composed [NODE ...]`: all without names, `otherwise` without the option."""
+    """Return the nodes that share a process by option `--composed [NODE ...]`: all if it has no names, `otherwise` without it."""
     return otherwise if names is None else names or ALL_NODES
 
 
 def programs(scenario: Scenario, seed: int = 1, *, folder: Path, scenario_source: str = "", composed: Collection[str] = (), lockstep: bool = True,
              record: Path | None = None, hold_for_goal: bool = False, overrides: Mapping[str, Mapping[str, Any]] | None = None) -> tuple[Program, ...]:
-    """The programs of a whole scenario.
+    """Return the programs of a whole scenario.
 
     Args:
         scenario: what is flown.
         seed: of every random number in the flight.
         folder: receives the parameter files.
-        scenario_source: file of the scenario, where it is none of `config/scenarios`.
+        scenario_source: file of the scenario, if it is not in `config/scenarios`.
         composed: nodes that share a process, as far as the scenario has them; the others have one each.
-        lockstep: simulation time waits for all who take part; otherwise the wall clock paces it.
+        lockstep: simulation time waits for all participants; otherwise the wall clock paces it.
         record: add a recorder that writes this MCAP file.
-        hold_for_goal: let simulation time begin when the mission has a goal.
-        overrides: of other nodes, node -> parameter -> value, over everything else.
+        hold_for_goal: hold simulation time until the mission has a goal.
+        overrides: node -> parameter -> value, over everything else; `record` and `hold_for_goal` replace those of their nodes.
 
     Raises:
         PerchError: parameters or nodes are refused, or the workspace is not built.
@@ -56,7 +56,7 @@ def programs(scenario: Scenario, seed: int = 1, *, folder: Path, scenario_source
 
 
 def node_programs(launches: Sequence[NodeLaunch], folder: Path, *, namespace: str = "", composed: Collection[str] = ()) -> tuple[Program, ...]:
-    """The programs for some nodes. Their parameter files are written into `folder`.
+    """Return the programs for some nodes, and write their parameter files into `folder`.
 
     Args:
         launches: nodes with their parameters.
@@ -97,12 +97,12 @@ def executable(package: str, name: str) -> str:
 
 
 def ros_arguments(launch: NodeLaunch, folder: Path, namespace: str = "") -> list[str]:
-    """The ROS arguments of a node; its parameter file is written into `folder`."""
+    """Return the ROS arguments of a node, and write its parameter file into `folder`."""
     return ["--ros-args", *in_namespace(namespace), "--params-file", str(launch.write(folder))]
 
 
 def in_namespace(namespace: str) -> list[str]:
-    """The remappings of a node in a namespace; none where it is empty."""
+    """Return the remapping arguments of a node in a namespace; none if it is empty."""
     if not namespace.strip("/"):
         return []
     return ["-r", f"__ns:={namespace}", *(word for topic in PER_VEHICLE for word in ("-r", f"{topic}:={topic.lstrip('/')}"))]

@@ -1,4 +1,4 @@
-"""HTML of every report: one file, offline, with the same style, tables and pictures."""
+"""HTML of the reports: self-contained pages with common style, tables and pictures."""
 
 from __future__ import annotations
 
@@ -31,32 +31,32 @@ class Html(str):
 
 
 def text(value: Any) -> str:
-    """Of a cell or a heading: escaped, if it is not HTML."""
+    """Return the HTML of a value: escaped, unless it is `Html`."""
     return value if isinstance(value, Html) else html.escape(str(value))
 
 
 def page(title: str, *parts: str, heading: str | None = None) -> str:
-    """A whole document.
+    """Return a whole document.
 
     Args:
-        title: of the window, and the heading where none is given.
+        title: of the window, and the heading if none is given.
         parts: HTML.
-        heading: HTML of the first line.
+        heading: HTML of the heading; None: the title.
     """
     return (f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{text(title)}</title><style>{_STYLE}</style>'
             f"<h1>{text(title) if heading is None else heading}</h1>{''.join(parts)}</html>\n")
 
 
 def section(title: str, body: str, absent: str = "") -> str:
-    """A heading and what is below it; `absent` where there is nothing below, and no section where that is empty, too."""
+    """Return a heading and its body, or `absent` if the body is empty; nothing if both are empty."""
     return f"<h2>{text(title)}</h2>{body or f'<p>{text(absent)}</p>'}" if body or absent else ""
 
 
 def table(rows: Iterable[Sequence[Any]], head: Sequence[Any] = (), classes: Sequence[str] = ()) -> str:
-    """Rows whose first cell is a heading; empty without rows.
+    """Return a table whose rows begin with a heading cell; empty without rows.
 
     Args:
-        rows: cells, escaped where they are not `Html`.
+        rows: cells, escaped unless they are `Html`.
         head: titles of the columns.
         classes: CSS class of each row's first cell.
     """
@@ -67,7 +67,7 @@ def table(rows: Iterable[Sequence[Any]], head: Sequence[Any] = (), classes: Sequ
 
 
 def image(figure: Figure | None, title: str = "") -> str:
-    """A figure; empty where there is none. `savefig` would draw it twice: the first time for its layout alone."""
+    """Return a figure as an image; empty for None. Without `savefig`, which draws twice, the first time only for the layout."""
     if figure is None:
         return ""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -79,7 +79,7 @@ def image(figure: Figure | None, title: str = "") -> str:
 
 
 def images(pictures: Iterable[tuple[str, np.ndarray]]) -> str:
-    """A grid of pictures: caption and pixels, uint8, grey or bgr; those wider than `WIDTH` are reduced."""
+    """Return a grid of pictures (caption; pixels, uint8, grey or bgr); those wider than `WIDTH` are scaled down."""
     figures = []
     for caption, pixels in pictures:
         if (scale := WIDTH / pixels.shape[1]) < 1.0:

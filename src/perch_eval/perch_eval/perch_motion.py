@@ -1,7 +1,7 @@
 """True perch motions without a simulator: rest on the ground, take-off, hover, perch on an inclined surface.
 
-For evaluating estimators by themselves, thousands of times: exact poses, rates and forces from a smooth path by
-differential flatness, and the readings that a vehicle's IMU would give.
+For evaluating estimators alone, in thousands of runs: exact poses, rates and forces from a smooth path by
+differential flatness, and simulated readings of a vehicle's IMU.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class ImuReadings:
-    """What an IMU reads along a motion: gyro, accel (n, 3), and the true biases (n, 3)."""
+    """IMU readings along a motion: gyro, accel (n, 3), and the true biases (n, 3)."""
 
     gyro: np.ndarray
     accel: np.ndarray
@@ -127,7 +127,7 @@ class PerchMotion:
         return p
 
     def sample(self, times: np.ndarray) -> Motion:
-        """The state at times [s], shape (n,)."""
+        """Return the states at times [s], shape (n,)."""
         derivatives = [path(times) for path in self._path]
         states = [flat_to_state(p, v, a, j, s, 0.0, 0.0, 0.0, 1.0) for p, v, a, j, s in zip(*derivatives)]
         R = np.array([s.R_WB for s in states])
@@ -136,9 +136,9 @@ class PerchMotion:
 
 
 def read_imu(motion: Motion, imu: ImuConfig, rng: np.random.Generator) -> ImuReadings:
-    """Readings of an IMU at the body's origin along a motion sampled at its rate: biases, walks, noise, saturation.
+    """Return readings of an IMU at the body's origin along a motion sampled at its rate: biases, walks, noise, saturation.
 
-    A sample is the mean over the period that ends at its stamp; over 2 ms the mean of both ends is that to 1e-4.
+    A sample is the mean over the period that ends at its stamp; over 2 ms the mean of both ends approximates it to 1e-4.
     """
     n = len(motion.times)
 

@@ -37,15 +37,15 @@ Panel = tuple[str, list[Line]]
 
 def panels(views: Views, content: Sequence[Panel], columns: int, height: float = 2.4, bounds: Sequence[float] = (),
            span: tuple[float, float] | None = None) -> Figure:
-    """Panels over time. Times of one flight are its own, those of several count from the start of each perch.
+    """Plot panels over time. With several flights, the time of each is relative to the start of its perch.
 
     Args:
-        views: whose start of the perch and contact are marked.
-        content: row by row.
-        columns: panels side by side.
+        views: flights; marked are the start of the perch and the contact, or, of several, the ends of the perches.
+        content: panels, row by row.
+        columns: number of panels side by side.
         height: of a panel [in].
-        bounds: drawn in each panel.
-        span: times that are shown [s]; None: around the perch.
+        bounds: values of horizontal lines in each panel.
+        span: displayed time span [s]; None: around the perch.
     """
     alone, rows = len(views) == 1, -(-len(content) // columns)
     low, high = span or (min(view.start - _zero(views, view) for view in views) - BEFORE,
@@ -71,12 +71,12 @@ def panels(views: Views, content: Sequence[Panel], columns: int, height: float =
 
 
 def _zero(views: Views, view: FlightView) -> float:
-    """Time of a flight that is called 0 s [s]."""
+    """Return the time of a flight that is shown as 0 s [s]."""
     return 0.0 if len(views) == 1 else view.start
 
 
 def _marks(views: Views) -> list[tuple[float, str, str, str]]:
-    """Time [s], colour, style and label of vertical lines: the perch begins, and the contact; of several flights the end of each."""
+    """Return time [s], colour, style and label of vertical lines: start of the perch, contact; of several flights, the ends."""
     if len(views) > 1:
         return [(view.end - view.start, view.colour, ":", "") for view in views]
     touch = touch_of(views[0].flight)
@@ -84,7 +84,7 @@ def _marks(views: Views) -> list[tuple[float, str, str, str]]:
 
 
 def _states(views: Views, pick: Callable[[States], np.ndarray], estimate: bool = True) -> list[Line]:
-    """Reference, truth and estimate of one flight; of several flights the truth of each."""
+    """Return curves of reference, truth and estimate of one flight, or of the truth of several flights."""
     if len(views) > 1:
         return [Line(view.truth.t - view.start, pick(view.truth), view.colour, view.name) for view in views]
     view = views[0]
@@ -130,7 +130,7 @@ def thrust_figure(*views: FlightView) -> Figure:
 
 
 def error_figure(view: FlightView) -> Figure | None:
-    """Estimation error with its own 3-sigma bounds over the whole flight; None where there is no estimate."""
+    """Plot the estimation error and the estimator's 3-sigma bounds over the whole flight; None if there is no estimate."""
     estimate = view.estimate
     if estimate is None:
         return None
@@ -195,7 +195,7 @@ def _pad_from_side(view: FlightView) -> np.ndarray:
 
 
 def _of_each(views: Views, kind: str, segments: Callable[[FlightView], np.ndarray]) -> list[tuple[np.ndarray, str, str]]:
-    """End points (2, 3) [m], colour and label of what stands at the flights' places: black where it is the same for all of them."""
+    """Return end points (2, 3) [m], colour and label of the pads or cables; black if the same for all flights."""
     found = [segments(view) for view in views]
     if all(np.array_equal(found[0], other) for other in found):
         looks = [("k", kind)]
@@ -205,7 +205,7 @@ def _of_each(views: Views, kind: str, segments: Callable[[FlightView], np.ndarra
 
 
 def _horizontal(view: FlightView) -> np.ndarray:
-    """Unit vector towards the pad, or along the perch, shape (2,)."""
+    """Return the horizontal unit vector towards the pad, or along the perch, shape (2,)."""
     begin, end = view.truth.at(np.array([view.start, view.end])).p
     for direction in (*([np.cross(view.pad[1][:, 1], [0.0, 0.0, 1.0])[:2]] if view.pad is not None else []), (end - begin)[:2]):
         if np.linalg.norm(direction) > 1e-6:

@@ -18,7 +18,7 @@ _TAIL = 12
 
 @dataclass(frozen=True)
 class Program:
-    """What is to be started.
+    """A program to start.
 
     Attributes:
         name: for logs and messages.
@@ -55,16 +55,16 @@ class Ending:
 
 
 class RunningProgram:
-    """A started program. It dies with the process (strictly: the thread) that started it.
+    """A started program. It is terminated when the process (strictly: the thread) that started it ends.
 
-    It gets a process group of its own, so that Ctrl-C does not reach it from the terminal, but stays in the session: Linux
-    shares processors between sessions first (autogroups), and in one of its own its niceness would mean nothing to others.
+    It has its own process group, so that Ctrl-C in the terminal does not reach it, but stays in the session: Linux shares
+    processors between sessions first (autogroups), so that in a session of its own its niceness would have no effect on others.
 
     Args:
         program: what to start.
-        log: file for everything it writes.
+        log: file for its output.
         environment: its environment variables.
-        on_line: receives (name, line), from a thread of its own, for each line that it writes.
+        on_line: called with (name, line) for each line of output, from a separate thread.
     """
 
     def __init__(self, program: Program, log: Path, environment: Mapping[str, str], on_line: Callable[[str, str], None]) -> None:
@@ -95,7 +95,7 @@ class RunningProgram:
             os.killpg(self.pid, number)
 
     def wait(self, timeout: float) -> bool:
-        """Whether it has ended within `timeout` seconds."""
+        """Wait at most `timeout` seconds for its end; return whether it has ended."""
         try:
             self._process.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -103,7 +103,7 @@ class RunningProgram:
         return True
 
     def ending(self) -> Ending:
-        """How it ended. Waits for the end."""
+        """Wait for its end and return how it ended."""
         code = self._process.wait()
         while self._reader.is_alive():  # to its last words; a grandchild may hold the pipe open, and is not waited for
             read = self._read_lines
@@ -113,7 +113,7 @@ class RunningProgram:
         return Ending(self.program.name, code, tuple(self._tail), self._log)
 
     def _read(self) -> None:
-        """Take everything that it writes, whatever becomes of the log: a program whose pipe is full waits, one whose pipe is closed dies."""
+        """Read all output, even if the log cannot be written: a full pipe would block the program, a closed one would end it."""
         assert self._process.stdout is not None
         with self._process.stdout as stream, ExitStack() as stack:
             file = None
@@ -129,6 +129,6 @@ class RunningProgram:
 
 
 def _die_with_parent() -> tuple[str, ...]:
-    """A prefix under which the kernel ends the program when its parent is killed, where the system has it."""
+    """Return a command prefix by which the kernel terminates the program when its parent ends; empty without `setpriv`."""
     setpriv = shutil.which("setpriv")
     return (setpriv, "--pdeathsig", "TERM", "--") if setpriv else ()

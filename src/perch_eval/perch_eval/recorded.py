@@ -1,4 +1,4 @@
-"""A recorded flight for the programs that show it, with the report that belongs to it and the vehicle that flew."""
+"""Reading a recorded flight for display, with its report and its vehicle."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from perch_eval.ros.recorded_flight import RecordedFlight
 
 
 def opened(path: Path, namespace: str = "") -> RecordedFlight:
-    """The flight of a file; one that is cut off or damaged is read as far as it goes, with a warning.
+    """Read the flight of a file; a truncated or damaged file is read as far as possible, with a warning.
 
     Raises:
         PerchError: no such recording.
@@ -30,10 +30,10 @@ def opened(path: Path, namespace: str = "") -> RecordedFlight:
 
 
 def report_of(flight: RecordedFlight) -> dict[str, Any]:
-    """What `report.json` beside the recording says; nothing where there is none, or, with a warning, that of another flight.
+    """Return the `report.json` beside the recording; empty if there is none or, with a warning, if it is of another flight.
 
     Raises:
-        PerchError: it is no report.
+        PerchError: the file cannot be read or is not a report.
     """
     path = Path(flight.source).with_name("report.json")
     try:
@@ -51,10 +51,10 @@ def report_of(flight: RecordedFlight) -> dict[str, Any]:
 
 
 def vehicle_of(flight: RecordedFlight, report: dict[str, Any], given: str = "") -> Vehicle | None:
-    """The vehicle that flew: as it is given, as the report says, or that of `robot_description`; None, with a warning: nobody tells.
+    """Return the vehicle that flew: the given one, that of the report or of `robot_description`; None, with a warning: unknown.
 
     Raises:
-        ConfigError: the one that is given is none.
+        ConfigError: the given vehicle does not exist or is refused.
     """
     if given:
         return load_vehicle(given)

@@ -37,16 +37,16 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
 
     Args:
         folder: output folder of the flight.
-        scenario: what was flown.
+        scenario: the scenario flown.
         seed: its seed.
         outcome: `perched`, or how it failed (lower-case name of the action's error code).
-        message: the mission's own words.
+        message: of the mission.
         wall_time: wall-clock duration of the flight [s].
         end_time: simulation time at which the goal ended [s].
-        start_time: simulation time at which it was sent [s]; None: the recording begins with it.
+        start_time: simulation time at which the goal was sent [s]; None: the start of the recording.
 
     Returns:
-        The content of `report.json`; with `unwritten`, the reason, where neither file could be written.
+        The content of `report.json`; with the reason as `unwritten` if the files could not be written.
     """
     vehicle = load_vehicle(scenario.vehicle)
     flight = RecordedFlight(folder / "flight.mcap")
@@ -105,13 +105,13 @@ def _timeline(flight: Flight) -> list[tuple[float, str]]:
 
 
 def last_diagnostics(flight: Flight) -> list[tuple[str, str]]:
-    """What each node said last of itself, in words, without its durations: `node_durations` has those of the whole flight."""
+    """Return the last diagnostics of each node in words, without durations, which `node_durations` has for the whole flight."""
     return [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items() if not DURATION.search(k)))
             for node, reports in diagnostics(flight).items()]
 
 
 def _with_unit(key: str, value: float) -> str:
-    """A figure of a node's diagnostics, whose unit is a part of its name, in words."""
+    """Return a diagnostics value in words, with the unit that is part of its name."""
     unit = _UNIT.search(key)
     return f"{_UNIT.sub('', key).replace('_', ' ')} {value:.4g}{f' {UNITS[unit[1]]}' if unit else ''}"
 
@@ -123,7 +123,7 @@ def _centimetres(values: Any) -> str:
 
 
 def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
-    """What came of a flight, by name, for the page and for the terminal."""
+    """Return the results of a flight, (name, text), for the page and the terminal."""
     rows = [("message", report["message"])]
     if f := report.get("inspection"):
         rows.append(("inspection", f"{f['collisions']} collisions ({f['reference_collisions']} of the reference); mean reprojection error "

@@ -1,6 +1,6 @@
-"""Which code a result is of: commit, and a digest of all sources without their docstrings, configuration and pinned libraries.
+"""Identification of the code of a result: commit, and digest of sources (without docstrings), configuration and pinned libraries.
 
-    python3 -m perch_eval.revision [PAGE...]      mark the pages of results that are of other code
+    python3 -m perch_eval.revision [PAGE...]      mark the results pages that were made by other code
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ def _git(*arguments: str) -> str:
 
 
 def commit() -> str:
-    """Of the code, with a plus sign where the sources have changed since; `unknown` outside a repository."""
+    """Return the commit of the code, with a plus sign if the sources have changed since; `unknown` outside a repository."""
     found = _git("rev-parse", "--short=7", "HEAD")
     return found + "+" * bool(_git("status", "--porcelain", "--untracked-files=no", *CODE)) if found else "unknown"
 
 
 def without_docstrings(source: bytes) -> bytes:
-    """Python source whose docstrings, of modules, classes, functions and attributes, are empty: what is left decides what it computes."""
+    """Return Python source without the docstrings of modules, classes, functions and attributes, which do not affect results."""
     return _DOCSTRING.sub(rb"\1...", source)
 
 
 def digest() -> str:
     """SHA-256 over all files of `CODE` that git tracks, as they are in the working tree, 12 digits; empty outside a repository.
 
-    Docstrings do not count: who improves their words need not fly again.
+    Docstrings do not count: rewording them does not invalidate results.
     """
     total = hashlib.sha256()
     names = _git("ls-files", *CODE).splitlines()
@@ -55,16 +55,16 @@ def digest() -> str:
 
 
 def made_of() -> dict[str, str]:
-    """The first entries of a file of results: which code they are of."""
+    """Return commit and digest of the code, the first entries of a results file."""
     return {"commit": commit(), "digest": digest()}
 
 
 def banner(commits: Collection[str], codes: Collection[str]) -> str:
-    """First lines of a page of results: its commits, whether they are older than the code, and how to see the changes.
+    """Return the banner of a results page: its commits, whether they are older than the code, and how to list the changes.
 
     Args:
-        commits: as `commit()` gave them when the results were made.
-        codes: as `digest()` gave them; empty words where that is not known.
+        commits: from `commit()` when the results were made.
+        codes: from `digest()`; empty strings if unknown.
     """
     now, several = digest(), "s" * (len(set(commits)) > 1)
     of = f"** (digest {now})" if now and set(codes) == {now} else f"{OLDER}**"
@@ -73,13 +73,13 @@ def banner(commits: Collection[str], codes: Collection[str]) -> str:
 
 
 def out_of_date(page: str, now: str) -> bool:
-    """Whether a page is of code of another digest than `now` and does not say so."""
+    """Return whether a page was made by code of another digest than `now` and is not marked as older."""
     made = _DIGEST.search(page)
     return OLDER not in page.partition("\n## ")[0] and (made is None or made[1] != now)
 
 
 def mark(pages: Iterable[Path]) -> list[Path]:
-    """Write into the banner of each page that is out of date that it is older than the code; returns these pages."""
+    """Mark the banner of each out-of-date page as older than the code; return these pages."""
     now, marked = digest(), []
     for path in pages:
         page = path.read_text()

@@ -1,4 +1,4 @@
-"""Results of long work in a file, a line of JSON each: a row is there or it is not, whatever becomes of the process."""
+"""Results of long runs in a file, one line of JSON each: a row is read completely or not at all, even after a killed process."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def rows_of(path: Path) -> Iterator[Any]:
-    """The rows of a file, also while it is written; none where there is no file. A last line that was cut off does not count.
+    """Yield the rows of a file, also while it is being written; none if there is no file. An incomplete last line is ignored.
 
     Raises:
         ValueError: a line is no JSON.
@@ -19,13 +19,13 @@ def rows_of(path: Path) -> Iterator[Any]:
 
 
 class Rows:
-    """Writes a file; one process at a time."""
+    """Writes a file of rows, from one process at a time."""
 
     def __init__(self, path: Path, known: Iterable[Any] = ()) -> None:
         """
         Args:
             path: of the file, which is replaced.
-            known: rows that it begins with.
+            known: rows to begin with.
 
         Raises:
             OSError: it cannot be written.

@@ -1,6 +1,6 @@
-"""Flights in 3-D, for a page: a picture that can be turned, moved through in time, and opened without a network.
+"""Interactive 3-D view of flights for a page: it can be rotated and played back, and works offline.
 
-Drawn on a canvas by a script of its own: the usual libraries would add megabytes to each report, or load them from elsewhere.
+It is drawn on a canvas by its own script, as the usual libraries would add megabytes to each report or need a network.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ BEFORE, AFTER = 1.5, 1.0  # shown around a perch [s]
 
 
 def scene_3d(views: Sequence[FlightView]) -> str:
-    """The picture as a part of a page.
+    """Return the view as a part of a page.
 
     Args:
-        views: what is shown; of one flight the times are its own, those of several count from the start of each perch.
+        views: flights to show; with several, the time of each is relative to the start of its perch.
     """
     legend = "".join(f'<span style="color:{view.colour}">&#9632;</span> {html.escape(view.name)} &nbsp; ' for view in views)
     flights = [_flight(view, 0.0 if len(views) == 1 else view.start) for view in views]

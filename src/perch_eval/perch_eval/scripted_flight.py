@@ -1,7 +1,7 @@
-"""Flights led by a script in the place of the mission: take-off, moves, perch; plant, VIO model, estimator and planner as everywhere.
+"""Flights commanded by a script instead of the mission: take-off, moves, perch. All other components are as usual.
 
-Truth enters the controller through the sensors' models alone; the pad is localised without an error of its own, so that what is
-measured is the controller.
+The truth reaches the controller only through the sensor models. The pad is localised without an error of its own, so that the
+controller is what is measured.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ LEAD = 0.04           # from an order to its start [s]
 TAKE_OFF_SPEED = 0.8  # mean [m/s]
 PATIENCE = 11.0       # until the estimator is ready, in simulated time [s]
 EVERY_STEP = {"controller.reference_period": 0.002}
-"""Parameter of the controller: its reference is judged at every step."""
+"""Parameter of the controller: the reference is published, and so evaluated, at every step."""
 
 
 def scenario_of(name: str, changes: Mapping[str, Any], controller: Mapping[str, Any]) -> Scenario:
-    """A scenario with changes, and parameters of the controller in the place of its own."""
+    """Return a scenario with changes; the given parameters of the controller replace the scenario's `parameters`."""
     mapping = {**extended_mapping("scenarios", name), "parameters": {"controller": {**EVERY_STEP, **controller}}, **changes}
     return config.from_mapping(Scenario, mapping, name)
 
 
 class ScriptedMission(Component[MissionParameters]):
-    """Sends the orders that a script calls for between two steps, and stops the motors when the IMU shows that the surface carries the
-    vehicle. Works at every step, before the controller.
+    """Sends the orders of a script between steps, and stops the motors when the IMU shows that the surface carries the vehicle.
+    It runs at every step, before the controller.
 
     Attributes:
-        status: of the controller, as it last told.
+        status: newest status of the controller.
         believed: newest odometry.
-        estimator: newest health.
-        wanted: where the controller last wanted to be [m], shape (3,).
-        contact_due: when the perch that was ordered meets the surface [s]; inf: none was.
+        estimator: newest health of the estimator.
+        wanted: newest reference position of the controller [m], shape (3,).
+        contact_due: planned time of contact of the ordered perch [s]; inf: none was ordered.
     """
 
     config_type = MissionParameters
@@ -80,72 +80,72 @@ class ScriptedMission(Component[MissionParameters]):
         self.contact_due = np.inf
 
     def on_imu(self, sample: ImuSample) -> None:
-        """For the adhesion."""
+        """Store the specific force for the adhesion monitor."""
         self._forces.append(sample.f_B)
 
     def on_odometry(self, state: OdometryState) -> None:
-        """Where the vehicle believes to be."""
+        """Store the odometry."""
         self.believed = state
 
     def on_controller_status(self, status: ControllerStatus) -> None:
-        """What it does."""
+        """Store the controller's status."""
         self.status = status
 
     def on_reference(self, reference: ControlReference) -> None:
-        """Where it wants to be."""
+        """Store the reference position."""
         self.wanted = np.array(reference.p)
 
     def on_estimator_status(self, health: EstimatorHealth) -> None:
-        """Whether it is ready."""
+        """Store the estimator's health."""
         self.estimator = health
 
     @property
     def state(self) -> State:
-        """Of the controller, as it last told."""
+        """Newest state of the controller."""
         return State.DISARMED if self.status is None else State(self.status.state)
 
     @property
     def message(self) -> str:
-        """Of the controller."""
+        """Newest message of the controller."""
         return "" if self.status is None else self.status.message
 
     @property
     def time(self) -> float:
-        """Of the newest odometry [s]."""
+        """Time of the newest odometry [s]."""
         return seconds(self.believed.stamp)
 
     @property
     def p_WB(self) -> np.ndarray:
-        """Where the vehicle believes to be [m], shape (3,)."""
+        """Estimated position of the vehicle [m], shape (3,)."""
         return np.array(self.believed.p_WB)
 
     @property
     def resting(self) -> bool:
-        """Whether it hovers without moving."""
+        """Whether the vehicle hovers at rest."""
         return self.state is State.HOVERING and float(np.linalg.norm(self.believed.v_B)) < self.config.mission.settle_speed
 
     def order(self, command: Command, reason: str) -> None:
-        """Command the controller."""
+        """Send a command to the controller."""
         self.command(ControllerCommand(self.believed.stamp, int(command), reason))
 
     def follow(self, trajectory: FlatTrajectory, at_end: AtEnd = AtEnd.HOLD) -> int:
-        """Order a trajectory; its number."""
+        """Order a trajectory and return its id."""
         self._orders += 1
         self.trajectory(TrajectoryOrder.of(self._orders, trajectory, at_end, self.config.mission.contact_time))
         return self._orders
 
     def go(self, offset: np.ndarray, duration: float) -> int:
-        """Order a move by an offset [m] from where the vehicle is or is on its way to, at rest at both ends."""
+        """Order a rest-to-rest move by an offset [m] from the reference (in a hover) or the estimate; return its id."""
         p = self.wanted if self.state is State.HOVERING else self.p_WB
         return self.follow(rest_to_rest(p, p + offset, 0.0, 0.0, duration, self.time + LEAD))
 
     def perch(self, trajectory: FlatTrajectory, target: Target) -> int:
-        """Order a perch on a target."""
+        """Order a perch on a target and return its id."""
         self._target, self.contact_due = target, trajectory.start_time + trajectory.duration
         return self.follow(trajectory, AtEnd.CONTACT)
 
     def on_check_contact(self, now: int) -> None:
-        """What the mission does after a perch."""
+        """Monitor the adhesion around the planned contact, as the mission does."""
         self._adhesion.add(np.array(self._forces).reshape(-1, 3))
         self._forces.clear()
         m = self.config.mission
@@ -159,21 +159,21 @@ class ScriptedMission(Component[MissionParameters]):
 
 
 class ScriptedFlight:
-    """A flight that its owner leads.
+    """A flight that its owner steps and commands.
 
     Attributes:
-        loop: everything that flies.
-        mission: gives the orders.
+        loop: simulated vehicle and components.
+        mission: sends the orders.
         simulation: the vehicle.
-        events: (time [s], state of the controller, text) of its log.
+        events: (time [s], state of the controller, text) of each line of the controller's log.
     """
 
     def __init__(self, scenario: Scenario, seed: int, without: Collection[str] = ()) -> None:
         """
         Args:
-            scenario: what is flown.
-            seed: of everything that is random.
-            without: components beside the target localiser that do not take part.
+            scenario: to fly.
+            seed: of every random number.
+            without: components that are left out, in addition to the target localiser.
 
         Raises:
             ConfigError: the scenario or a node's parameter is refused.
@@ -188,25 +188,25 @@ class ScriptedFlight:
 
     @property
     def time(self) -> float:
-        """[s]"""
+        """Time of the flight [s]."""
         return self.loop.time
 
     @property
     def state(self) -> State:
-        """Of the controller at this step."""
+        """State of the controller at this step."""
         return self.controller.flight.state
 
     def step(self) -> None:
-        """One control period."""
+        """Advance by one control period."""
         self.loop.step()
 
     def run(self, until: float) -> None:
-        """Fly on to a time [s], or to the end of the motors."""
+        """Advance to a time [s], or until the rotors are broken."""
         while self.time < until and not self.simulation.plant.crashed:
             self.step()
 
     def arm(self) -> float:
-        """Wait for the estimator, and arm; returns when that was ordered [s].
+        """Wait for the estimator, then arm; return the time of that order [s].
 
         Raises:
             PerchError: the estimator is not ready in time.
@@ -222,19 +222,19 @@ class ScriptedFlight:
         return ordered
 
     def flew(self, order: int | None) -> bool:
-        """Whether the controller has taken up an order; where it has not, its last event says why."""
+        """Return whether the controller has accepted an order; if not, its last event has the reason."""
         return any(status.trajectory_id == order for status in self.loop.trace.values("controller/status"))
 
     def perch_plan(self, p: np.ndarray, start: float, shift: np.ndarray) -> FlatTrajectory:
-        """The planner's perch from a hover.
+        """Plan a perch from a hover.
 
         Args:
             p: hover [m], as estimated.
-            start: time of its start [s].
-            shift: estimated minus true position [m]: the pad is localised from where the vehicle believes to be.
+            start: start time of the plan [s].
+            shift: estimated minus true position [m]; the pad, localised from the estimate, is shifted by it.
 
         Raises:
-            PerchError: there is none.
+            PerchError: the planner refuses.
         """
         pad = self.simulation.pad
         [answer] = self.loop.request("perching_planner", "plan_perch", PerchPlanRequest(
@@ -245,7 +245,7 @@ class ScriptedFlight:
         return answer.trajectory
 
     def perch(self, place: np.ndarray) -> int | None:
-        """Plan a perch from the place of the hover [m], and order it where the vehicle rests; None elsewhere."""
+        """If the vehicle rests, plan a perch from the hover position [m] and order it; return its id, or None."""
         if not self.mission.resting:
             return None
         shift, pad = self.mission.p_WB - self.simulation.state.p_WB, self.simulation.pad

@@ -1,9 +1,9 @@
-"""Removes the shared memory that killed ROS processes leave behind.
+"""Removal of the shared memory that killed ROS processes leave behind.
 
-Fast DDS removes its segments when a process ends by itself. A killed one leaves up to some megabytes in
-`/dev/shm`, until the machine is full. Other people's segments are never touched: only those that our own
-processes were seen to use, and that nobody uses any more, or whose maker has ended: a participant that was
-not told of that end holds such a segment until its process ends.
+Fast DDS removes its segments when a process ends by itself. A killed process leaves up to some megabytes in
+`/dev/shm`, which accumulate. Segments are removed only if our own processes were observed to use them, and
+if no process uses them or their creator has ended: a participant that does not notice that end keeps such a
+segment mapped until its own process ends.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class SharedMemory:
             self.seen |= self._used_by(self._proc / str(pid))
 
     def clean(self) -> list[str]:
-        """Remove the remembered segments that no process uses any more, or whose maker has ended, with their lock files; one that a
-        process which is about to end has made anew is removed by the next call.
+        """Remove the remembered segments that no process uses, or whose creator has ended, with their lock files. One that is
+        re-created meanwhile by a process about to end is removed by the next call.
 
         Returns:
             The files that were removed.
@@ -57,7 +57,7 @@ class SharedMemory:
         return removed
 
     def unused(self, segments: Iterable[str]) -> set[str]:
-        """Those that no process uses now, or whose maker has ended."""
+        """Return the segments that no process uses now, or whose creator has ended."""
         used = {segment for process in self._proc.glob("[0-9]*") for segment in self._used_by(process)}
         return {segment for segment in segments if segment not in used or _abandoned(Path(segment))}
 
@@ -75,17 +75,17 @@ def ports(domain: int) -> range:
 
 
 def of_ports(domain: int) -> set[Path]:
-    """Files of the segments in which the ports of a ROS domain receive, with their locks."""
+    """Return the files, with locks, of the segments in which the ports of a ROS domain receive."""
     return {file for file in _FOLDER.glob("*fast*_port*") if (of := PORT.match(file.name)) and int(of[1]) in ports(domain)}
 
 
 def segment(file: Path) -> str:
-    """The segment to which a file belongs: itself, or that whose lock it is."""
+    """Return the segment of a file: the file itself, or the segment that it locks."""
     return str(file.with_name(re.sub(r"^sem\.|_[es]l$|_mutex$", "", file.name)))
 
 
 def _abandoned(segment: Path) -> bool:
-    """Whether the maker of a segment has ended: while it lives, Fast DDS holds the lock of the file `<segment>_el`."""
+    """Return whether the creator of a segment has ended: until then Fast DDS holds the lock of the file `<segment>_el`."""
     if PORT.match(segment.name):  # the next participant takes it over
         return False
     try:

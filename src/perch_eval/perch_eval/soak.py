@@ -1,4 +1,4 @@
-"""The stack for hours: perch, depart, perch again, in one run; memory, descriptors, threads and shared memory of every process."""
+"""Run the stack for hours (perch, depart, perch again); record memory, descriptors, threads and shared memory."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Sample:
 
     Attributes:
         rss: resident memory [MB].
-        descriptors, threads: how many.
+        descriptors, threads: their numbers.
     """
 
     rss: float
@@ -58,15 +58,15 @@ class Sample:
 
 @dataclass(frozen=True)
 class Flight:
-    """One perch and what came after it.
+    """One perch and the departure after it.
 
     Attributes:
         time: simulation time at its end [s].
-        outcome: of the goal, `perched` where it is good.
-        departed: the vehicle has left for a hover.
-        words: of what went wrong; empty: nothing.
+        outcome: of the goal; `perched` is success.
+        departed: whether the vehicle has left for a hover.
+        words: message of the failure; empty: none.
         processes: name -> its sample.
-        shared: in /dev/shm, of everybody on this machine [MB].
+        shared: size of /dev/shm, with the files of all users [MB].
     """
 
     time: float
@@ -78,33 +78,33 @@ class Flight:
 
 
 def sample(pid: int) -> Sample:
-    """A process as it is now."""
+    """Return a sample of a process."""
     process = psutil.Process(pid)
     return Sample(round(process.memory_info().rss / 1e6, 3), process.num_fds(), process.num_threads())
 
 
 def slope(values: Sequence[float]) -> float | None:
-    """Growth per 100 flights after the first ones, by least squares; None: too few to tell."""
+    """Return the growth per 100 flights, without the first `SETTLED`, by least squares; None if there are too few flights."""
     rest = np.asarray(values[SETTLED:], float)
     return float(100.0 * np.polyfit(np.arange(len(rest)), rest, 1)[0]) if len(rest) >= 20 else None
 
 
 def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: float, flights: int | None, folder: Path,
         keep: Callable[[Sequence[Flight]], object]) -> list[Flight]:
-    """Fly until there has been so much simulated time, or so many flights.
+    """Fly until a simulated time or number of flights is reached, failures repeat, or the stack fails.
 
     Args:
         name: of the scenario.
         seed: of every random number.
-        cameras: look at images; otherwise they are replaced by error models.
+        cameras: render and process images; otherwise error models replace them.
         composed: nodes that share a process.
         hours: of simulated time.
-        flights: at most so many; None: as time allows.
+        flights: maximum number of flights; None: no limit.
         folder: receives logs and parameters.
-        keep: receives what has been flown, now and then: should this process be killed, that is not lost.
+        keep: called every `KEPT` flights with all flights so far, to save them.
 
     Raises:
-        PerchError: the stack does not come up, or breaks.
+        PerchError: scenario or nodes are refused, the workspace is not built, or no ROS domain is free.
     """
     source = config.find("scenarios", name)
     scenario = load_scenario(source)
@@ -149,7 +149,7 @@ def _once(pilot: MissionClient, scenario: Any, stack: Stack) -> Flight:
 
 
 def growth(flights: Sequence[Flight]) -> dict[str, dict[str, Any]]:
-    """What each process does: its slope [MB per 100 flights], and the range of descriptors and threads after the first flights."""
+    """Return memory, its slope [MB per 100 flights], and the later range of descriptors and threads, of each process."""
     found = {}
     for name in flights[0].processes:
         own = [flight.processes[name] for flight in flights]
@@ -161,7 +161,7 @@ def growth(flights: Sequence[Flight]) -> dict[str, dict[str, Any]]:
 
 
 def verdicts(flights: Sequence[Flight]) -> list[str]:
-    """What is not as it should be."""
+    """Return the problems found, one line each."""
     found = [f"flight {k + 1}: {flight.outcome}{'' if flight.departed else ', no departure'}: {flight.words}"
              for k, flight in enumerate(flights) if not flight.departed or flight.outcome != "perched"]
     for name, of in growth(flights).items():
@@ -194,7 +194,7 @@ def plot(flights: Sequence[Flight], file: Path) -> None:
 
 
 def page(folder: Path) -> str:
-    """The page of all soaks whose figures lie in a folder."""
+    """Return the page of all soak runs whose results are in a folder."""
     runs = {file: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
     text = ["# Soak", "", banner([run["commit"] for run in runs.values()], [run.get("digest", "") for run in runs.values()]), "",
             "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart,",
@@ -220,7 +220,7 @@ def page(folder: Path) -> str:
 
 
 def _grouped(problems: list[str]) -> list[str]:
-    """Equal problems of several flights as one."""
+    """Merge equal problems of several flights."""
     flights: dict[str, list[str]] = {}
     for problem in problems:
         flight, _, words = problem.removeprefix("flight ").partition(": ") if problem.startswith("flight ") else ("", "", problem)
@@ -261,7 +261,7 @@ def _soak(args: argparse.Namespace) -> int:
 
 
 def _write(args: argparse.Namespace, code: Mapping[str, str], began: float, flights: Sequence[Flight]) -> list[str]:
-    """Write figures and page of what has been flown; returns what is not as it should be."""
+    """Write figures and page of the flights so far; return the problems found."""
     name, problems = args.name or Path(args.scenario).stem, verdicts(flights)
     plot(flights, args.out / f"{name}.png")
     (args.out / f"{name}.json").write_text(json.dumps({

@@ -1,4 +1,4 @@
-"""Starts, watches and stops a group of programs, each in its own process group. Knows nothing of ROS."""
+"""Start, monitoring and stop of a group of programs, each in its own process group. Independent of ROS."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from perch_eval.program import Ending, Program, RunningProgram
 from perch_eval.shared_memory import SharedMemory
 
 _ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 1.0), (signal.SIGKILL, 1.0))
-"""Signals to stop with, and how long each has [s]: on a busy machine a recording may need seconds to be finished."""
+"""Signals to stop programs with, and time-out of each [s]: on a busy machine, finishing a recording may take seconds."""
 _AT_START = ((signal.SIGTERM, 0.5), (signal.SIGKILL, 1.0))
-"""The same while programs load and compile: they have nothing to finish, and Python would show a traceback of SIGINT."""
+"""The same while programs load and compile: they have nothing to finish, and on SIGINT Python would print a traceback."""
 _POLL_S = 0.02
 
 
 class StackError(PerchError):
-    """A program ended before its time, or did not get ready.
+    """Raised when a program cannot be started, ends unexpectedly, or does not become ready.
 
     Attributes:
         endings: the programs that ended.
@@ -36,20 +36,20 @@ class StackError(PerchError):
 
     @property
     def callers_mistake(self) -> bool:
-        """Whether a program refused what it was given (exit code 2)."""
+        """Whether a program refused its arguments or parameters (exit code 2)."""
         return any(ending.code == 2 for ending in self.endings)
 
 
 class Stack:
     """A group of programs, started together and stopped together.
 
-    Use it as a context manager: whatever happens inside, nothing is left running. Start it from a thread that
-    outlives it.
+    Use it as a context manager: at the end of its block, all programs are stopped, also after exceptions. The thread
+    that starts it must outlive it.
 
     Args:
         programs: what to start, in order.
         log_dir: receives `<program>.log` of each.
-        on_line: receives (program name, line) for each line of output, from several threads.
+        on_line: called with (program name, line) for each line of output, from several threads.
     """
 
     def __init__(self, programs: Sequence[Program], log_dir: Path, on_line: Callable[[str, str], None] = lambda name, line: None) -> None:
@@ -76,7 +76,7 @@ class Stack:
         """Start every program.
 
         Raises:
-            StackError: an executable does not exist.
+            StackError: a program cannot be started.
         """
         self._log_dir.mkdir(parents=True, exist_ok=True)
         for program in self._programs:
@@ -121,7 +121,7 @@ class Stack:
         self._memory.observe((*self.pids.values(), os.getpid()))
 
     def wait(self) -> tuple[Ending, ...]:
-        """Wait until a program ends; those that have ended."""
+        """Wait until a program ends; return those that have ended."""
         while not (endings := self.endings()):
             time.sleep(_POLL_S)
         return endings
@@ -132,9 +132,9 @@ class Stack:
             raise StackError("\n".join(str(ending) for ending in endings), endings)
 
     def stop(self) -> dict[str, Ending]:
-        """Stop everything: interrupt, where that does not help terminate, then kill. Repeating it is harmless.
+        """Stop all programs: interrupt, then terminate, then kill. It may be called repeatedly.
 
-        A second Ctrl-C does not interrupt it, where it is called by the main thread.
+        In the main thread it is not interrupted by a second Ctrl-C.
 
         Returns:
             How each program ended.
@@ -157,7 +157,7 @@ class Stack:
 
 @contextmanager
 def _deferred_signals() -> Iterator[None]:
-    """Let what would interrupt wait until the block has ended."""
+    """Defer SIGINT and SIGTERM until the block has ended."""
     received: list[int] = []
     try:
         with _handled_by(lambda number, _: received.append(number)):
@@ -169,7 +169,7 @@ def _deferred_signals() -> Iterator[None]:
 
 @contextmanager
 def _handled_by(handler: Any) -> Iterator[None]:
-    """Give SIGINT and SIGTERM to `handler`, where this is the main thread: no other one is interrupted."""
+    """Handle SIGINT and SIGTERM by `handler` within the block, in the main thread; other threads receive no signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -22,7 +22,7 @@ class Rate:
 
     @classmethod
     def of(cls, outcomes: Iterable[bool]) -> Rate:
-        """Of the trials' outcomes: whether each was a success."""
+        """Return the rate of trials whose outcome is true."""
         found = list(outcomes)
         return cls(sum(found), len(found))
 
@@ -33,7 +33,7 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson score interval: sensible at 0 and at 1, too; (0, 1) without trials."""
+        """Wilson score interval, valid also at rates of 0 and 1; (0, 1) without trials."""
         if not self.trials:
             return 0.0, 1.0
         k, n, z = self.successes, self.trials, float(ndtri(0.975))
@@ -56,7 +56,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Iterable[float | None]) -> Spread:
-        """Of any values; those that are None or not finite are left out."""
+        """Return the spread of values; those that are None or not finite are left out."""
         finite = [float(v) for v in values if v is not None and math.isfinite(v)]
         if not finite:
             return cls(math.nan, math.nan, math.nan, 0)

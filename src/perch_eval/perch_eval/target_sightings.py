@@ -1,7 +1,7 @@
-"""The pad seen by the front camera along a flight of `estimation_flight`, and how wrong and how sure its pose relative to the vehicle is.
+"""Localisation of the pad along a flight of `estimation_flight`: errors and covariances of its pose relative to the vehicle.
 
-The images have the camera's calibration errors, the body's pose is the estimator's, so that everything is in the error that
-`target/pose` claims to know: that of T_BS, in the axes of W.
+The images have the camera's calibration errors and the body's pose is the estimator's. The error thus has all parts that the
+covariance of `target/pose` describes: it is the error of T_BS, in the axes of W.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Sightings:
 
 
 def estimated_body(flight: Flight, track: EstimatorTrack, time: float) -> BodyState:
-    """The estimator's state at a time [s]: the truth and the track's error there, whose covariance is turned into W's axes."""
+    """Return the estimated state at a time [s], from the truth and the track's error; its covariance is in the axes of W."""
     truth = flight.motion.sample(np.array([time]))
     k = int(np.argmin(np.abs(track.times - time)))
     e = np.array([np.interp(time, track.times, column) for column in track.errors.T])
@@ -50,14 +50,14 @@ def estimated_body(flight: Flight, track: EstimatorTrack, time: float) -> BodySt
 
 
 def see_target(scenario: Scenario, flight: Flight, track: EstimatorTrack, seed: int, begin: float, end: float) -> Sightings:
-    """Look at the pad at the camera's rate.
+    """Localise the pad in images at the camera's rate.
 
     Args:
         scenario: room, pad and realism.
-        flight: its data; its seed should be `seed`.
-        track: the estimator along it.
+        flight: sensor data, made with the same seed.
+        track: of the estimator along the flight.
         seed: of the camera's calibration errors and noise.
-        begin, end: of the images [s].
+        begin, end: time span of the images [s].
     """
     mount, board = load_vehicle(scenario.vehicle).mounts["front"], load_board(scenario.target.board)
     rng = np.random.default_rng([seed, 8])

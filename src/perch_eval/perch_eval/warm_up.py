@@ -1,9 +1,9 @@
-"""Compile once what every flight needs: the numerics are compiled at first use and cached beside their sources.
+"""Compile the numerics that every flight needs; they are compiled at first use and cached beside their sources.
 
     python -m perch_eval.warm_up flight     builds all control laws and flies a scenario without ROS, which needs no built workspace
-    python -m perch_eval.warm_up nodes      runs its nodes on the ground, in one process, for a moment of simulated time
+    python -m perch_eval.warm_up nodes      runs the nodes of the scenario on the ground, in one process, for some simulated time
 
-A kernel that is left to be compiled in flight keeps its node silent for so long that the vehicle may drop it.
+Compiling a kernel in flight blocks its node for so long that the vehicle may drop the node from the lockstep.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PATIENCE = 600.0  # [s] wall clock
 
 
 def flight() -> bool:
-    """Build the laws and fly; whether the flight succeeded."""
+    """Build the control laws and fly; return whether the flight succeeded."""
     scenario = load_scenario(SCENARIO)
     for law in LAWS:
         build_law(law, load_vehicle(scenario.vehicle), ControllerParameters(vehicle=scenario.vehicle))
@@ -36,7 +36,7 @@ def flight() -> bool:
 
 
 def nodes() -> bool:
-    """Run the nodes; whether they got as far as they should.
+    """Run the nodes; return whether simulation time advanced as far as intended.
 
     Raises:
         PerchError: a node ended, or did not come up.

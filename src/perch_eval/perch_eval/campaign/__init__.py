@@ -1,1 +1,1 @@
-"""Campaigns: thousands of flights over drawn conditions, their failures classified and ranked."""
+"""Campaigns: thousands of flights under randomised conditions, with failures classified and ranked."""

@@ -1,4 +1,4 @@
-"""Why a flight failed: one class each, from the mission's result and from what the vehicle truly touched."""
+"""Classification of flights: one cause of failure each, from the mission's result and the true contacts."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _BY_OUTCOME = {"not_found": "not_found", "refused": "refused", "timeout": "timeo
 
 
 def cause_of(outcome: str, contacts: Sequence[Contact], adhesion: Adhesion) -> str:
-    """`perched`, or one of `MEANING`. A perch counts only where the truth shows the vehicle attached at the end; an inspection that
-    came to its end is a success too, where the truth shows no collision.
+    """Return `perched`, or the cause of failure: a key of `MEANING`. A perch succeeds only if the vehicle is truly attached at
+    the end; a completed inspection succeeds if there was no true collision.
 
     Args:
-        outcome: of the mission, in lower case.
-        contacts: what the vehicle truly touched, in order.
-        adhesion: the limits of the velcro.
+        outcome: outcome of the mission, in lower case.
+        contacts: true contacts of the vehicle, in order.
+        adhesion: limits of the velcro.
     """
     if outcome == "perched":
         return SUCCESS if _holds(contacts) else "came_off"
@@ -47,7 +47,7 @@ def cause_of(outcome: str, contacts: Sequence[Contact], adhesion: Adhesion) -> s
 
 
 def _bounce(touch: Contact, adhesion: Adhesion) -> str:
-    """Which limit of the velcro a touch missed by most."""
+    """Return the limit of the velcro that a contact missed by the largest ratio."""
     if "outside the pad" in touch.reason:
         return "missed_pad"
     low, high = adhesion.normal_speed

@@ -1,4 +1,4 @@
-"""Flies a campaign: many flights over drawn conditions, classified failures, one results file, one HTML report."""
+"""Fly a campaign: many flights under randomised conditions, classified failures, one results file, one HTML report."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ exit code: 0 every run was flown (whatever came of it), 1 some could not be carr
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     out = command_parser("campaign.py", __doc__, EXAMPLES)
     out.add_argument("campaign", metavar="CAMPAIGN", help="name in config/campaigns, or a YAML file")
     out.add_argument("--engine", metavar="NAME", help=f"{' or '.join(ENGINES)}, or your own as module:function (default: the file's)")
@@ -67,7 +67,7 @@ def fly_all(campaign: Campaign, results: Results, jobs: int, cluster: str | None
 
     Raises:
         PerchError: the cluster does not answer.
-        KeyboardInterrupt: what is finished is in the results.
+        KeyboardInterrupt: interrupted; the results of finished runs are written.
     """
     known = results.all()
     finished = {r.number for r in known}
@@ -81,7 +81,7 @@ def fly_all(campaign: Campaign, results: Results, jobs: int, cluster: str | None
 
 
 def keep_worst(campaign: Campaign, found: list[RunResult], out: Path) -> None:
-    """Fly the worst flights once more, with a recording and a report each: the same seed gives the same flight."""
+    """Repeat the worst flights with a recording and a report each; the same seed gives the same flight."""
     by_number = {run.number: run for run in campaign.runs}
     for result in worst(found, campaign.keep_worst):
         folder = out / flight_folder(result.number)
@@ -90,7 +90,7 @@ def keep_worst(campaign: Campaign, found: list[RunResult], out: Path) -> None:
 
 
 def summary(found: list[RunResult]) -> str:
-    """Success and causes for the terminal, most frequent first."""
+    """Return the success rate and the causes of failure as text, most frequent cause first."""
     rate = Rate.of(r.cause == SUCCESS for r in found)
     lines = [f"success: {rate}  (95 % Wilson)"]
     for cause, flights in Counter(r.cause for r in found if r.cause != SUCCESS).most_common():

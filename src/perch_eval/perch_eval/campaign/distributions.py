@@ -1,4 +1,4 @@
-"""How a varied quantity is drawn: choice, uniform, normal, or a grid."""
+"""Distributions of varied quantities: choice, uniform, normal, or grid."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ KINDS = ("choice", "uniform", "normal", "grid")
 
 @dataclass(frozen=True)
 class Distribution:
-    """One varied quantity.
+    """Distribution of one varied quantity.
 
     Attributes:
         kind: one of `KINDS`.
-        values: choices, or grid values, or (low, high), or (mean, sigma).
-        low, high: limits of a normal, which is drawn again outside them.
+        values: choices, grid values, (low, high) of a uniform, or (mean, sigma) of a normal distribution.
+        low, high: limits of a normal distribution; values outside are drawn again.
     """
 
     kind: str
@@ -35,7 +35,7 @@ class Distribution:
         return f"{self.kind} {list(self.values)}{limits}"
 
     def draw(self, rng: np.random.Generator) -> Any:
-        """One value; a grid is not drawn but gone through."""
+        """Draw one value; not for grids, whose values are all flown."""
         if self.kind == "choice":
             return self.values[int(rng.integers(len(self.values)))]
         if self.kind == "uniform":
@@ -48,10 +48,10 @@ class Distribution:
 
 
 def parse(source: str, key: str, entry: Any) -> Distribution:
-    """The distribution that a campaign's file describes, as in `{uniform: [0.8, 3.0]}`.
+    """Parse a distribution from an entry of a campaign file such as `{uniform: [0.8, 3.0]}`.
 
     Raises:
-        ConfigError: anything else.
+        ConfigError: the entry is not a valid distribution.
     """
     if not isinstance(entry, Mapping):
         raise ConfigError(source, key, f"{entry!r} is not a mapping such as {{uniform: [0.8, 3.0]}}")
@@ -80,10 +80,10 @@ def parse(source: str, key: str, entry: Any) -> Distribution:
 
 
 def parse_seed(source: str, key: str, entry: Any) -> Distribution:
-    """The distribution of flights' seeds: a grid or a choice.
+    """Parse the distribution of the flights' seeds: a grid or a choice.
 
     Raises:
-        ConfigError: anything else than whole numbers in the range of seeds.
+        ConfigError: another distribution, or values other than integers in the range of seeds.
     """
     found = parse(source, key, entry)
     if found.kind not in ("grid", "choice") or not all(type(v) is int and 0 <= v <= LARGEST_SEED for v in found.values):
@@ -92,7 +92,7 @@ def parse_seed(source: str, key: str, entry: Any) -> Distribution:
 
 
 def _sort(value: Any) -> str:
-    """What values of one quantity have in common; empty: what none can have."""
+    """Return the kind of a value, which all values of a quantity must share; empty: the value is not permitted."""
     if isinstance(value, list):
         return f"{len(value)} numbers" if value and all(map(_is_number, value)) else ""
     return "number" if _is_number(value) else type(value).__name__ if isinstance(value, (str, bool)) else ""

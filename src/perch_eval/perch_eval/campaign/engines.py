@@ -1,4 +1,4 @@
-"""What carries out one run: the in-process engine, the real nodes, or a function of your own (`module:function`)."""
+"""Engines that carry out one run: in process, on the real nodes, or a user-defined function (`module:function`)."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Task:
     """One run, ready to be sent to a worker.
 
     Attributes:
-        run: number, seed, varied values.
+        run: number, seed and varied values.
         scenario: the scenario's mapping.
-        engine: name.
-        sensing: which cameras the in-process engine renders.
-        keep: folder for the flight's full report; empty: none is kept.
+        engine: name of the engine.
+        sensing: cameras that the in-process engine renders.
+        keep: folder for the flight's recording and report; empty: neither is kept.
     """
 
     run: Run
@@ -48,15 +48,15 @@ class Task:
 
     @classmethod
     def of(cls, campaign: Campaign, run: Run, keep: str = "") -> Task:
-        """A run of a campaign."""
+        """Create the task of a campaign's run."""
         return cls(run, campaign.mapping(run), campaign.engine, campaign.sensing, keep)
 
 
 def resolve(name: str) -> Callable[[Task], RunResult]:
-    """The engine of a name.
+    """Return the engine with a name.
 
     Raises:
-        PerchError: there is none.
+        PerchError: there is no such engine.
     """
     if name not in ENGINES and ":" not in name:
         raise PerchError(f"engine {name!r} is not one of {', '.join(ENGINES)}, nor of the form module:function")
@@ -67,7 +67,7 @@ def resolve(name: str) -> Callable[[Task], RunResult]:
 
 
 def carry_out(task: Task) -> RunResult:
-    """Fly one run; whatever goes wrong is a result as well."""
+    """Fly one run; an exception becomes a result with the cause `error`."""
     began = time.perf_counter()
     one_thread_for_sums()
     cv2.setNumThreads(1)  # runs share the cores already; OpenCV's own threads cost each of them 15 % more CPU time
@@ -82,12 +82,12 @@ Measure = Callable[[Flight, Scenario, Vehicle], dict[str, float | None]]
 
 
 def fly_in_process(task: Task, measure: Measure = lambda *_: {}, linger: float = 0.0) -> RunResult:
-    """One run in this process.
+    """Fly one run in this process.
 
     Args:
-        task: what is flown.
-        measure: further figures of the flight.
-        linger: flown on after its end [s].
+        task: run to be flown.
+        measure: function that computes further figures of the flight.
+        linger: simulated time after the goal's end [s]; 0.5 s where the flight is kept.
     """
     scenario = config.from_mapping(Scenario, task.scenario, f"run {task.run.number}")
     trace = fly(scenario, task.run.seed, task.sensing, 0.5 if task.keep else linger)
@@ -107,7 +107,7 @@ def fly_in_process(task: Task, measure: Measure = lambda *_: {}, linger: float =
 
 
 def fly_on_the_stack(task: Task) -> RunResult:
-    """One run on the real nodes: composed, in lockstep, in a ROS domain of its own."""
+    """Fly one run on the real nodes: composed, in lockstep, in a separate ROS domain."""
     from perch_eval.demo import fly
     from perch_eval.nodes import ALL_NODES
     from perch_eval.ros.recorded_flight import RecordedFlight

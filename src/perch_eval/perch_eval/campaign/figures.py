@@ -1,4 +1,4 @@
-"""The figures of a campaign's report."""
+"""Figures of a campaign's report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GOOD, BAD = "#2b8a3e", "#c92a2a"
 
 
 class Axis:
-    """The cells of one varied quantity: its values where there are few, bins of equal width otherwise."""
+    """Cells of one varied quantity: its distinct values where there are few, bins of equal width otherwise."""
 
     def __init__(self, values: Sequence[Any]) -> None:
         distinct = sorted(set(map(_key, values)), key=lambda v: (isinstance(v, str), v))
@@ -30,7 +30,7 @@ class Axis:
             self.labels = [v if isinstance(v, str) else f"{v:.4g}" for v in distinct]
 
     def cell(self, value: Any) -> int:
-        """Number of the cell that a value lies in."""
+        """Return the index of the cell that contains a value."""
         if self._edges is None:
             return self._values.index(_key(value))
         return min(max(int(np.searchsorted(self._edges, _key(value), side="right")) - 1, 0), BINS - 1)
@@ -43,7 +43,7 @@ def _key(value: Any) -> float | str:
 
 
 def success_map(found: Sequence[RunResult], x: str, y: str) -> Figure:
-    """Success rate over two varied quantities, with the counts in each cell."""
+    """Plot the success rate over two varied quantities, with the counts in each cell."""
     across, up = Axis([r.values[x] for r in found]), Axis([r.values[y] for r in found])
     good, total = np.zeros((len(up.labels), len(across.labels))), np.zeros((len(up.labels), len(across.labels)))
     for r in found:
@@ -66,7 +66,7 @@ def success_map(found: Sequence[RunResult], x: str, y: str) -> Figure:
 
 
 def success_curve(found: Sequence[RunResult], name: str) -> Figure:
-    """Success rate over one varied quantity with 95 % Wilson intervals."""
+    """Plot the success rate over one varied quantity with 95 % Wilson intervals."""
     axis = Axis([r.values[name] for r in found])
     cells = [[r for r in found if axis.cell(r.values[name]) == k] for k in range(len(axis.labels))]
     rates = [Rate.of(r.cause == SUCCESS for r in cell) for cell in cells]
@@ -83,10 +83,10 @@ def success_curve(found: Sequence[RunResult], name: str) -> Figure:
 
 
 def distributions(found: Sequence[RunResult], names: dict[str, tuple[str, float]]) -> Figure:
-    """Histograms of metrics, successes against failures.
+    """Plot histograms of metrics, successes against failures.
 
     Args:
-        found: the results.
+        found: results of the runs.
         names: metric -> (title with unit, factor).
     """
     columns = 3

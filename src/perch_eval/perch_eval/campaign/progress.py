@@ -1,4 +1,4 @@
-"""How far a campaign is, and how long it will take."""
+"""Progress of a campaign and estimate of the remaining time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Progress:
-    """One line that is rewritten on a terminal; elsewhere a line every few seconds. Without a total it says how many there have been."""
+    """Progress line, rewritten in place on a terminal; elsewhere one line per period. Without a total it shows the count only."""
 
     def __init__(self, total: int | None, already: int = 0, good_already: int = 0, what: str = "runs", out: TextIO | None = None,
                  period: float = 10.0) -> None:
@@ -23,7 +23,7 @@ class Progress:
         self._began = self._shown = time.monotonic()
 
     def add(self, good: bool | None = None) -> None:
-        """One more is finished; None: nobody judges it."""
+        """Count one more as finished; None: it is neither good nor bad."""
         self._done += 1
         self._good += bool(good)
         self._judged |= good is not None
@@ -34,7 +34,7 @@ class Progress:
             self._out.flush()
 
     def line(self, now: float) -> str:
-        """The line at a time of the monotonic clock."""
+        """Return the progress line at a time of the monotonic clock [s]."""
         fresh, elapsed = self._done - self._already, max(now - self._began, 1e-9)
         rate = fresh / elapsed
         text = f"  {self._done}" + ("" if self._total is None else f"/{self._total}") + f" {self._what}"
@@ -53,7 +53,7 @@ class Progress:
 
 
 def counted(found: Iterable[T], total: int, good: Callable[[T], bool | None] = lambda _: None, **options: Any) -> Iterator[T]:
-    """What is found, counted on its way; further options are those of `Progress`."""
+    """Yield the items of `found` and count each in a progress line; further options are those of `Progress`."""
     with closing(Progress(total, **options)) as progress:
         for one in found:
             yield one
@@ -61,7 +61,7 @@ def counted(found: Iterable[T], total: int, good: Callable[[T], bool | None] = l
 
 
 def span(seconds: float) -> str:
-    """A duration in words."""
+    """Return a duration as text."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

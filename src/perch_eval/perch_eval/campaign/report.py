@@ -1,4 +1,4 @@
-"""One HTML page for a campaign: success, causes, maps, error distributions, links to the kept flights."""
+"""HTML report of a campaign: success rate, causes of failure, maps, error distributions, links to kept flights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results of a campaign in one file, which outlives its writer. And which are worth a look."""
+"""Results of a campaign in one file that survives a crash of its writer, and selection of the worst flights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from perch_eval.rows import Rows, rows_of
 
 @dataclass(frozen=True)
 class RunResult:
-    """What one flight gave."""
+    """Result of one run."""
 
     number: int
     seed: int
@@ -31,17 +31,17 @@ class ResultsError(PerchError):
 
 
 class Results:
-    """The file: whose results it holds, then a row for each run. One process writes; others may read at any time."""
+    """Results file: a header row with the campaign's name and digest, then a row per run. One process writes; others may read."""
 
     def __init__(self, path: Path, name: str, digest: str, resume: bool) -> None:
         """
         Args:
-            path: of the file.
-            name, digest: of the campaign.
-            resume: go on where an earlier campaign ended.
+            path: path of the file.
+            name, digest: name and digest of the campaign.
+            resume: continue an earlier campaign from its results.
 
         Raises:
-            ResultsError: it holds another campaign's results, or results and `resume` is not asked for, or it is damaged.
+            ResultsError: the file holds another campaign's results, holds results while `resume` is False, or is damaged.
         """
         whose, found = read_results(path)
         if whose and whose.get("digest") != digest:
@@ -56,13 +56,13 @@ class Results:
             raise _unreadable(path, error) from None
 
     def add(self, result: RunResult) -> None:
-        """Write one row; a run that is there already is left as it is."""
+        """Write the row of a run, unless the file already holds that run."""
         if result.number not in self._found:
             self._rows.add(asdict(result))
             self._found[result.number] = result
 
     def all(self) -> list[RunResult]:
-        """Every result, by number."""
+        """Return all results, sorted by number."""
         return [self._found[number] for number in sorted(self._found)]
 
     def close(self) -> None:
@@ -71,10 +71,12 @@ class Results:
 
 
 def read_results(path: Path) -> tuple[dict[str, Any], list[RunResult]]:
-    """Whose results a file holds, and the results by number, also while a campaign is writing it; nothing where there is no file.
+    """Return a file's header row and its results sorted by number; both are empty where there is no file.
+
+    The file may be read while a campaign is writing it.
 
     Raises:
-        ResultsError: it cannot be read.
+        ResultsError: the file cannot be read.
     """
     try:
         whose, *rows = [*rows_of(path)] or [{}]
@@ -93,12 +95,12 @@ def _unreadable(path: Path, error: Exception) -> ResultsError:
 
 
 def flight_folder(number: int) -> Path:
-    """Of a kept flight, in the campaign's folder."""
+    """Return the folder of a kept flight, relative to the campaign's folder."""
     return Path("flights", f"run_{number:05d}")
 
 
 def severity(result: RunResult) -> float:
-    """How far from a good contact a flight was; larger is worse. Flights without a contact count by their tracking."""
+    """Return a score of a flight's contact and tracking errors; larger is worse. Without a contact only tracking RMSE counts."""
     m = result.metrics
 
     def of(name: str) -> float:
@@ -109,9 +111,9 @@ def severity(result: RunResult) -> float:
 
 
 def worst(found: list[RunResult], count: int) -> list[RunResult]:
-    """The worst flights: in turn one of each cause, the frequent causes first, the severest first within a cause.
+    """Return the worst flights: one of each cause in turn, frequent causes first, most severe first within a cause.
 
-    Runs that could not be carried out have nothing to show and are left out.
+    Successful flights follow, most severe first. Runs that could not be carried out are left out.
     """
     groups: dict[str, list[RunResult]] = defaultdict(list)
     for result in found:

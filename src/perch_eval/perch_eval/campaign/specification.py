@@ -1,4 +1,4 @@
-"""What a campaign is: a scenario, what varies in it, how often. One YAML file in `config/campaigns/` each.
+"""Specification of a campaign: a scenario, the varied quantities and the number of runs; a YAML file in `config/campaigns/`.
 
 A varied name is a field of the scenario (`target.distance`, `wind.gust_sigma`), an entry of one of its vectors
 (`wind.steady.0`), or a node's parameter (`parameters.controller.gains.lead`). `seed` can be varied by a grid, too.
@@ -31,12 +31,12 @@ from perch_sim.scenario import Scenario
 
 
 RUNS_MAX = 20_000
-"""Of a campaign, all points of its grids together."""
+"""Largest number of runs of a campaign, over all points of its grids."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _File:
-    """A campaign's file."""
+    """Content of a campaign file."""
 
     name: str = label()
     description: str = text("")
@@ -61,14 +61,15 @@ class Run:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign that has been checked: every run's scenario is valid.
+    """Checked campaign: the scenario of every run is valid.
 
     Attributes:
-        name, description, engine, sensing, axes, keep_worst: as in the file.
+        name, description, engine, sensing, keep_worst: as in the file, the engine unless replaced.
+        axes: varied names on the axes of the success map; empty: there is no map.
         base: the scenario's mapping, before the variation.
         vary: varied name -> distribution.
-        runs: what is flown.
-        digest: SHA-256 of everything that decides the results.
+        runs: runs to be flown.
+        digest: SHA-256 of everything that determines the results.
     """
 
     name: str
@@ -83,7 +84,7 @@ class Campaign:
     digest: str
 
     def mapping(self, run: Run) -> dict[str, Any]:
-        """The scenario's mapping of a run, as a scenario file holds it."""
+        """Return the scenario's mapping for a run, in the form of a scenario file."""
         out = copy.deepcopy(self.base)
         for name, value in run.values.items():
             place(out, name, value)
@@ -95,11 +96,11 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
 
     Args:
         path: name in `config/campaigns`, or a file.
-        engine: replaces the file's.
-        runs: replaces the file's.
+        engine: replaces the engine of the file.
+        runs: replaces the number of runs of the file.
 
     Raises:
-        ConfigError: the file, a distribution, or a drawn scenario is refused.
+        ConfigError: the file, a distribution, or a drawn scenario is invalid.
     """
     file = config.find("campaigns", path)
     content = config.load(_File, file)
@@ -125,10 +126,10 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
 
 
 def _check(campaign: Campaign, file: str) -> None:
-    """Make sure that every run can be flown: its scenario, what that names, and the nodes' parameters.
+    """Check that every run can be flown: its scenario, the files named there, and the nodes' parameters.
 
     Raises:
-        ConfigError: names the run and its values.
+        ConfigError: a run cannot be flown; the message contains its number and values.
     """
     vehicles: dict[tuple[str, str], Vehicle] = {}
     parameters: dict[str, Any] = {}
@@ -147,7 +148,7 @@ def _check(campaign: Campaign, file: str) -> None:
 
 
 def place(mapping: dict[str, Any], name: str, value: Any) -> None:
-    """Set a dotted name in a scenario's mapping; a number names an entry of a vector."""
+    """Set a dotted name in a scenario's mapping; a number as last part is an index into a vector."""
     *groups, leaf = name.split(".")
     value = list(value) if isinstance(value, tuple) else value
     if groups[:1] == ["parameters"] and len(groups) >= 2:
@@ -166,7 +167,7 @@ def place(mapping: dict[str, Any], name: str, value: Any) -> None:
 
 
 def _default(groups: list[str]) -> Any:
-    """What a scenario has where its mapping says nothing, vectors as lists."""
+    """Return the default value of a scenario's field, vectors as lists."""
     value: Any = Scenario(name="defaults")
     for group in groups:
         value = getattr(value, group, None)
@@ -184,12 +185,12 @@ def _group(mapping: dict[str, Any], groups: list[str]) -> dict[str, Any]:
 
 
 def _draw(vary: Mapping[str, Distribution], runs: int, seed: int) -> tuple[Run, ...]:
-    """Grid points, each with the same `runs` draws of the rest: points are compared under equal conditions.
+    """Draw the runs: all grid points with the same `runs` draws of the other quantities, so that points are comparable.
 
-    The k-th draw is the same however many there are, and its flight's seed whatever is varied.
+    The k-th draw does not depend on the number of draws, nor its flight's seed on which quantities are varied.
 
     Raises:
-        ConfigError: two flights would be the same.
+        ConfigError: two flights would be identical.
     """
     grids = {name: d.values for name, d in vary.items() if d.kind == "grid"}
     points = [dict(zip(grids, point)) for point in itertools.product(*grids.values())]
@@ -207,5 +208,5 @@ def _draw(vary: Mapping[str, Distribution], runs: int, seed: int) -> tuple[Run, 
 
 
 def in_words(values: Mapping[str, Any]) -> str:
-    """Varied values."""
+    """Return varied values as text."""
     return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())

@@ -1,4 +1,4 @@
-"""Where runs are carried out: a pool of processes on this machine, or a Dask cluster. Neither loses a result."""
+"""Workers that carry out runs: a pool of processes on this machine, or a Dask cluster. Neither loses a result."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ ATTEMPTS = 3  # a run whose worker died so often is given up
 
 
 def _end(*_: object) -> None:
-    """An exception, so that nodes are stopped on the way out; the pool takes one out of a run for its result, so there is a limit."""
+    """Raise SystemExit on SIGTERM, so that nodes are stopped on the way out; an alarm ends the process if that takes too long."""
     signal.alarm(END_LIMIT)
     sys.exit(1)
 
 
 def prepare_worker() -> None:
-    """Ctrl-C is the campaign's own matter, and no worker outlives its campaign."""
+    """Set up the signals of a worker: the campaign alone handles Ctrl-C, and a worker ends with its campaign."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # what the worker starts has signals of its own
     signal.signal(signal.SIGTERM, _end)
@@ -42,7 +42,7 @@ def prepare_worker() -> None:
 
 
 def _call(work: Callable[[T], R], item: T) -> R:
-    """Told to stop in the middle of its work, the pool would take that for the work's own end, and wait for ever for another."""
+    """Do the work; SystemExit ends the process. The pool would take it for the work's result, and the worker would never end."""
     try:
         return work(item)
     except SystemExit:
@@ -51,19 +51,19 @@ def _call(work: Callable[[T], R], item: T) -> R:
 
 def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int | None = None, dead: Callable[[T], R] | None = None
                  ) -> Iterator[tuple[T, R]]:
-    """Results of work in processes, as they are finished.
+    """Yield (item, result) of work in processes, in order of completion.
 
-    A worker that dies takes the pool with it: it is made anew, and what was under way is done again. Processes are not forked: BLAS threads
-    of the parent do not survive a fork. They end with whoever waits for them.
+    If a worker dies, the pool is broken: a new one is created, and unfinished items are repeated. Processes are spawned, not
+    forked: BLAS threads of the parent do not survive a fork. The processes end with the process that waits for them.
 
     Args:
-        work: to be done, a function of a module.
+        work: function to be called, defined at module level.
         items: its arguments.
-        jobs: processes; None: one on each core.
-        dead: result of an item whose worker died `ATTEMPTS` times.
+        jobs: number of processes; None: one per core.
+        dead: returns the result of an item whose worker died `ATTEMPTS` times.
 
     Raises:
-        PerchError: a worker died so often, and there is no `dead`.
+        PerchError: a worker died `ATTEMPTS` times at an item, and there is no `dead`.
     """
     jobs = jobs or os.cpu_count() or 1
     waiting, attempts = deque(enumerate(items)), Counter[int]()
@@ -99,22 +99,22 @@ def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int | None = 
 
 
 def dead(task: Task, why: str = f"its worker died {ATTEMPTS} times") -> RunResult:
-    """The result of a run whose workers died."""
+    """Return the result of a run whose workers died."""
     return RunResult(task.run.number, task.run.seed, "error", "failed", why, task.run.values)
 
 
 def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
-    """Carry out runs of a campaign in `jobs` processes; results come as they are finished."""
+    """Carry out runs of a campaign in `jobs` processes; yield results in order of completion."""
     for _, result in in_processes(carry_out, tasks, jobs, dead):
         yield result
 
 
 def on_cluster(tasks: Sequence[Task], address: str) -> Iterator[RunResult]:
-    """Carry out tasks on a Dask cluster; Dask repeats what a lost worker had under way.
+    """Carry out tasks on a Dask cluster, which repeats the unfinished tasks of a lost worker.
 
     Args:
-        tasks: what to carry out.
-        address: of the scheduler (`tcp://host:8786`).
+        tasks: runs to be flown.
+        address: address of the scheduler (`tcp://host:8786`).
 
     Raises:
         PerchError: the scheduler does not answer.

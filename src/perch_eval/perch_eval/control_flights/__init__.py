@@ -1,1 +1,1 @@
-"""Flights that show what the controller does: under faults, and one law against the other. No ROS."""
+"""Flights that evaluate the controller: under faults, cancelled, and with the control laws compared. No ROS."""

@@ -1,4 +1,4 @@
-"""Flights whose goal is cancelled at a given time before the planned contact, and how they end."""
+"""Flights whose goal is cancelled at a given time before the planned contact, and their ends."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ AT_REST = 0.3              # speed of a hover [m/s]
 
 @dataclass(frozen=True)
 class Aborted:
-    """One flight.
+    """Result of one flight.
 
     Attributes:
-        scenario, seed, before: what was flown, and when the goal was cancelled: time before the planned contact [s].
-        planned: the vehicle left the plan by a planned way out.
-        end: by the truth: never cancelled, broken (the vehicle has hit something), attached, hovering; or else the controller's state.
-        message: the mission's words.
+        scenario, seed: name of the scenario, and seed of the flight.
+        before: time of the cancellation before the planned contact [s].
+        planned: whether the vehicle left the plan by a planned way out.
+        end: true end: never cancelled, broken (crashed), attached or hovering; otherwise the controller's state.
+        message: message of the mission's result.
         rate: largest body rate after the cancellation [rad/s].
-        margin: least thrust margin of a rotor's command after it.
-        distance: least distance of the centre of mass from the surface's plane after it [m]; of a wire's scenario meaningless.
-        settled: from the cancellation to the goal's end [s].
+        margin: least thrust margin of the controller after the cancellation.
+        distance: least distance of the centre of mass from the surface's plane after it [m]; meaningless with wires.
+        settled: time from the cancellation to the goal's end [s].
     """
 
     scenario: str
@@ -45,10 +46,10 @@ class Aborted:
 
 
 def fly_aborted(scenario: str, seed: int, before: float) -> Aborted:
-    """Fly a scenario, and cancel its goal `before` seconds ahead of the planned contact.
+    """Fly a scenario and cancel its goal `before` seconds ahead of the planned contact.
 
     Raises:
-        PerchError: the scenario is refused.
+        PerchError: the scenario is invalid.
     """
     what = load_scenario(scenario)
     loop = arrange(what, seed, Sensing())

@@ -1,4 +1,4 @@
-"""The controllers on the same flights: geometric and NMPC, each with and without L1, nominal and disturbed."""
+"""Comparison of the controllers on the same flights: geometric and NMPC, each with and without L1, nominal and disturbed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight, sce
 SCENARIO = "surface_90"
 CONTROLLERS = {"geometric": ("geometric", False), "geometric + L1": ("geometric", True),
                "nmpc": ("nmpc", False), "nmpc + L1": ("nmpc", True)}
-"""Name -> `controller.type`, `controller.adaptive`."""
+"""Name -> (`controller.type`, `controller.adaptive`)."""
 
 CONDITIONS: dict[str, dict] = {
     "nominal": {},
@@ -28,11 +28,11 @@ LINE, LINE_TIME = np.array([0.7, 1.0, 0.4]), 2.0  # [m], [s]
 
 
 def fly(controller: str, condition: str, maneuver: str, seed: int) -> tuple[np.ndarray, str]:
-    """Take off, hover until the adaptation has settled, then a line and a hover, or the perch on the wall; estimated state.
+    """Take off, hover until the adaptation has settled, then fly a line and hover, or perch on the wall; the state is estimated.
 
     Returns:
-        RMSE of the true position against the reference per axis [m], shape (3,), nan where the manoeuvre was not begun; and the
-        outcome: held, perched, or what went wrong.
+        RMSE of the true position against the reference per axis [m], shape (3,), nan if the manoeuvre did not begin; and the
+        outcome: held, perched, or the failure.
     """
     law, adaptive = CONTROLLERS[controller]
     flight = ScriptedFlight(scenario_of(SCENARIO, CONDITIONS[condition], {"controller.type": law, "controller.adaptive": adaptive}), seed)

@@ -1,6 +1,6 @@
-"""Faults at random moments of a perching flight, and how each flight ends.
+"""Perching flights with a fault at a random time, and the end of each flight.
 
-A flight takes off, hovers, and perches on a wall; one fault strikes between the order to take off and the planned contact.
+A flight takes off, hovers, and perches on a wall; one fault occurs between the take-off command and the planned contact.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PAUSE = 0.5          # hover before the perch [s]
 SETTLE = 4.0         # a hover that lasts so long is an end [s]
 LIMIT = 25.0         # after the fault a flight is judged as it is [s]
 END_STATES = ("hovering", "landed", "perched")
-"""What counts as a way out."""
+"""Ends that count as safe."""
 
 
 Strike = Callable[[ScriptedFlight, np.random.Generator], str]
@@ -38,9 +38,9 @@ class Fault:
     """A fault in flight.
 
     Attributes:
-        name: for people and files.
-        about: what happens.
-        strike: makes it happen, and says what exactly.
+        name: name in pages and files.
+        about: description of the fault.
+        strike: function that applies the fault and returns its details.
         scenario: changes to the scenario.
     """
 
@@ -144,17 +144,18 @@ FAULTS = (
 
 @dataclass(frozen=True)
 class Ending:
-    """How a flight ended.
+    """End of a flight with a fault.
 
     Attributes:
-        fault, seed: which flight.
-        time: of the fault, since the order to take off [s]; phase: state of the controller then.
-        done: what the fault was.
-        before: true height of the centre of mass [m], distance from the wall [m], speed [m/s], tilt [deg] when it struck.
+        fault, seed: name of the fault, and seed of the flight.
+        time: time of the fault since the take-off command [s].
+        phase: state of the controller at the fault.
+        done: details of the applied fault.
+        before: true height of the centre of mass [m], distance from the wall [m], speed [m/s], tilt [deg] at the fault.
         end: hovering, landed, perched, crashed or lost.
-        touched: surfaces hit by other parts than the plate without breaking anything.
-        events: of the controller from the fault on.
-        search: of a flight without a good end: what rotors at their limits could still have done when the fault struck.
+        touched: collisions, each with the body that was hit and the normal speed.
+        events: events of the controller from the fault on.
+        search: search for a way out from the state at the fault; None if the end is safe.
     """
 
     fault: str
@@ -170,11 +171,11 @@ class Ending:
 
 
 def fly_fault(fault: Fault, seed: int) -> Ending:
-    """One flight with one fault.
+    """Fly one flight with one fault.
 
     Args:
-        fault: what happens.
-        seed: of the flight and of the fault's moment and size.
+        fault: fault to be applied.
+        seed: seed of the flight, and of the fault's time and size.
     """
     scenario = scenario_of(SCENARIO, fault.scenario, {"flight.silence_time": SILENCE_TIME})
     flight = ScriptedFlight(scenario, seed)
@@ -224,7 +225,7 @@ def _situation(flight: ScriptedFlight) -> tuple[float, float, float, float]:
 
 
 def _end(flight: ScriptedFlight) -> str:
-    """The end by the truth; the controller's word counts for a hover alone."""
+    """Return the end of the flight by the true state; a hover also requires the controller's state."""
     plant, x = flight.simulation.plant, flight.simulation.state
     if plant.crashed:
         return "crashed"

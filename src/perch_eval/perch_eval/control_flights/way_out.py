@@ -1,8 +1,7 @@
-"""Did physics leave a way out? All extreme rotor commands, tried on the plant itself from the moment of a fault.
+"""Search for a physically possible way out of a fault: extreme rotor commands, simulated on the plant from the time of the fault.
 
-Rotor thrusts act on tilt and height almost linearly over the tenth of a second that a vehicle near the floor has, so that what can be
-reached is bounded by commands at the rotors' limits. The search knows the true state, has no delay and no law: it asks more than any
-controller could do.
+Over the tenth of a second that a vehicle near the floor has, rotor thrusts act on tilt and height almost linearly, so that
+commands at the rotors' limits bound what can be reached. The search uses the true state without delay, as no controller can.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ HORIZON = 0.4                              # a vehicle that has broken nothing s
 
 @dataclass(frozen=True)
 class Search:
-    """What the search found.
+    """Result of the search.
 
     Attributes:
-        tried: sequences of rotor commands.
-        survived: how many of them broke nothing within `HORIZON`; the search stops at the first.
-        latest: time after the fault of the latest break among the others [s].
-        turn_deg: no rotor commands turn the vehicle by more than this within `latest`, compared with rotors that stay as they are [deg].
+        tried: number of sequences of rotor commands.
+        survived: number of sequences without a crash within `HORIZON`; 0 or 1, as the search stops at the first.
+        latest: longest time from the fault that any sequence was flown, up to its crash or `HORIZON` [s].
+        turn_deg: bound on the turn of the vehicle within `latest`, relative to constant rotor speeds [deg].
     """
 
     tried: int
@@ -39,10 +38,10 @@ class Search:
 
 
 def search(plant: Plant) -> Search:
-    """From the plant's present state, every combination of rotors at their limits, changed to any other once, or never.
+    """Try every combination of rotors at their limits from the plant's present state, kept or changed once to any other.
 
     Args:
-        plant: as the fault has left it; it is copied.
+        plant: plant right after the fault; it is copied.
     """
     tried, latest, survived = 0, 0.0, False
     for periods, survived in _sequences(plant):
@@ -53,7 +52,7 @@ def search(plant: Plant) -> Search:
 
 
 def _sequences(plant: Plant) -> Iterator[tuple[int, bool]]:
-    """Every sequence of commands: the control periods flown, and whether nothing broke."""
+    """Yield (control periods flown, whether there was no crash) of every sequence of commands."""
     corners = [np.array(c) for c in itertools.product((plant.body.speed_min, plant.body.speed_max), repeat=4)]
     steps = round(HORIZON / CONTROL_PERIOD)
     switches = sorted(round(t / CONTROL_PERIOD) for t in SWITCHES)
@@ -71,7 +70,7 @@ def _sequences(plant: Plant) -> Iterator[tuple[int, bool]]:
 
 
 def _advance(plant: Plant, command: np.ndarray, steps: int) -> int:
-    """Fly on with a command until something breaks; returns the control periods flown."""
+    """Advance the plant with a constant command until it crashes; return the control periods flown."""
     for k in range(steps):
         plant.advance(command)
         if plant.crashed:
@@ -80,7 +79,7 @@ def _advance(plant: Plant, command: np.ndarray, steps: int) -> int:
 
 
 def _greatest_turn(plant: Plant, duration: float) -> float:
-    """A bound from the rotors' lag and levers: every rotor goes to the farther limit, and all moments add up [deg]."""
+    """Return a bound on the turn from the rotors' lag and levers: each rotor goes to its farther limit, moments add up [deg]."""
     body, t = plant.body, np.linspace(0.0, duration, 200)[:, None]
     now = body.thrust_coefficient * plant.rotor_speed**2
     share = np.exp(-t / body.time_constant)

@@ -1,1 +1,1 @@
-"""The papers' tables and figures, regenerated and judged."""
+"""Regeneration of the papers' tables and figures, with a verdict on each value."""

@@ -1,4 +1,4 @@
-"""[P] section III: a catenary of 185 m as 15 straight segments."""
+"""[P] section III: approximation of a catenary of 185 m by 15 straight segments."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SAG_SHARE = 0.025  # of the span: usual for distribution and transmission lines 
 
 
 def cable_of_length(length: float, sag_share: float) -> Catenary:
-    """A level cable of a given length [m] whose sag is a given share of its span."""
+    """Return a level cable of a given length [m] whose sag is a given share of its span."""
     def cable(span: float) -> Catenary:
         return Catenary.from_sag(np.zeros(3), np.array([span, 0.0, 0.0]), sag_share * span)
 
@@ -22,7 +22,7 @@ def cable_of_length(length: float, sag_share: float) -> Catenary:
 
 
 def cable_sections(effort: Effort) -> list[Section]:
-    """The paper's figures for its 185 m line."""
+    """Return the segments' errors and lengths beside the paper's values for its 185 m line."""
     cable = cable_of_length(LENGTH, SAG_SHARE)
     fit = fit_segments(cable, COUNT)
     lengths = np.linalg.norm(np.diff(fit.vertices, axis=0), axis=1)

@@ -1,4 +1,4 @@
-"""Regenerates the tables and figures of both papers, each value beside the paper's with a verdict."""
+"""Regenerate the tables and figures of both papers, each value beside the paper's with a verdict."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ PARTS = {
     "p_inspection": "inspection:inspection_sections", "p_cable": "cable:cable_sections",
     "c_faults": "control:fault_sections", "c_comparison": "control:comparison_sections",
     "c_way_out": "ways_out:sections", "c_contact": "contact:contact_sections", "c_consistency": "consistency:consistency_sections"}
-"""Part -> module here and function, which makes its sections, in the order of the page."""
+"""Part -> `module:function` in this package that returns its sections, in the order of the page."""
 FLIGHTS = {"seeds": ("flights of each perch condition", 5, 100), "line-seeds": ("flights of each powerline scenario", 1, 20),
            "layouts": ("random layouts of the inspection", 3, 20)}
-"""Option -> what it counts, how many by default, and with --full."""
+"""Option -> (what it counts, default, default with --full)."""
 BEYOND_PAPERS = ("c_faults", "c_comparison", "c_way_out", "c_contact", "c_consistency")
-"""Hundreds of flights of their own: with --full, or by name."""
+"""Parts with hundreds of additional flights, which are evaluated only with --full or by name."""
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     out = command_parser("evaluate.py", __doc__, EXAMPLES)
     size = out.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="both papers, with few flights (default)")
@@ -70,7 +70,7 @@ def _regenerate(args: argparse.Namespace) -> int:
 
 
 def evaluate(effort: Effort, names: list[str]) -> list[Section]:
-    """The sections of some parts; a part that breaks is a row that is not available, not the end of the others."""
+    """Return the sections of some parts; a part that raises an error becomes a row `not available`, and the others continue."""
     sections = []
     for k, name in enumerate(names):
         began = time.monotonic()

@@ -1,6 +1,6 @@
 """Consistency of VIO, estimator and target over Monte-Carlo runs of rendered perches: NEES and NIS with their bounds.
 
-Judged in the air: on the ground the vehicle stands exactly where it was told, and no covariance of use is as small as that.
+Only samples in the air count: on the ground the position is known exactly, and no useful covariance is that small.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LOOK = (-1.5, 0.4)    # the pad is looked at from the hover until it leaves the 
 
 @dataclass(frozen=True)
 class _Run:
-    """One flight: the estimator along it, VIO's NEES at its poses, the pad as it was seen."""
+    """Result of one flight: track of the estimator, NEES of VIO at its poses, sightings of the pad."""
 
     track: EstimatorTrack
     vio_times: np.ndarray
@@ -42,7 +42,7 @@ class _Run:
 
 
 def consistency_sections(effort: Effort) -> list[Section]:
-    """NEES of estimator, VIO and target over time, its figure, RMSE through the perch and mean NIS."""
+    """Return NEES of estimator, VIO and target over time with its figure, RMSE during the perch, and mean NIS."""
     out = Section("c_consistency", "Consistency of the estimators",
                   f"`{SCENARIO}` with cameras rendered and calibration errors drawn, seeds {effort.seeds.start} to {effort.seeds.stop - 1}; a motion that "
                   "is the same in every run, VIO's start parameters wrong as declared (1 mm, 1 mrad). NEES per dimension, averaged over the flight; the "
@@ -74,7 +74,7 @@ def consistency_sections(effort: Effort) -> list[Section]:
 
 
 def _fly(seed: int) -> _Run:
-    """One flight."""
+    """Fly one flight and run the estimators on it."""
     cv2.setNumThreads(1)
     scenario = load_scenario(SCENARIO)
     motion, flight = flights.motion_of(scenario, seed), flights.fly(scenario, seed)
@@ -89,6 +89,6 @@ def _fly(seed: int) -> _Run:
 
 
 def _judged(groups: dict[str, slice], times: np.ndarray, errors: list[np.ndarray], covariances: list[np.ndarray]) -> list[Consistency]:
-    """NEES of parts of a state over runs, each with errors (m, n) and covariances (m, n, n) at m times."""
+    """Return the consistency of parts of a state; each run has errors (m, n) and covariances (m, n, n) at m times."""
     e, P = np.array(errors), np.array(covariances)
     return [consistency.judge(name, times, consistency.nees(e[..., s], P[..., s, s]), s.stop - s.start) for name, s in groups.items()]

@@ -1,4 +1,4 @@
-"""Contacts beyond the papers: how fast the vehicle can turn to a wall, and surfaces that hang over."""
+"""Contacts beyond the papers: body rates of perches on a wall, and overhanging surfaces."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from perch_eval.metrics import FIGURES
 from perch_eval.statistics import Rate, Spread
 
 CAMPAIGNS = ("aggressive", "overhang")
-"""In config/campaigns."""
+"""Names in config/campaigns."""
 COLUMNS = {"max_body_rate_deg_s": 0, "contact_normal_speed_m_s": 2, "contact_tangential_speed_m_s": 2, "contact_tilt_error_deg": 1}
-"""Figure of a flight -> digits."""
+"""Metric of a flight -> number of decimals."""
 
 
 def contact_sections(effort: Effort) -> list[Section]:
-    """How many perch under which conditions; writes `contact.md` and `contact.json`."""
+    """Return the success rate under each condition; write `contact.md` and `contact.json`."""
     out = Section("c_contact", "Contacts", "Body rate against success at a wall, and surfaces that hang over: the campaigns of that name in "
                   "config/campaigns, cameras by their error models. Speeds and tilt at each contact: contact.md.")
     groups = {f"`{name}`, cameras rendered": flights for name, flights in perches(effort).items()}
@@ -57,5 +57,5 @@ def _rate(flights: Sequence[RunResult]) -> Rate:
 
 
 def _others(flights: Sequence[RunResult]) -> str:
-    """What became of those that did not perch."""
+    """Return the causes of the failed flights with their counts, as text."""
     return ", ".join(f"{n} {cause.replace('_', ' ')}" for cause, n in Counter(r.cause for r in flights if r.cause != SUCCESS).most_common())

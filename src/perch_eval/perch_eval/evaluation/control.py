@@ -1,4 +1,4 @@
-"""The controller under faults, and the controllers compared on the same flights: pages of their own beside the results."""
+"""Flights with faults, and comparison of the controllers on the same flights; each has a separate page of results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ENDINGS = ("hovering", "landed", "perched", "crashed", "lost")
 
 
 def fault_sections(effort: Effort) -> list[Section]:
-    """Every fault at random moments; writes `faults_in_flight.md` and its JSON."""
+    """Return the ends of flights with each fault at random times; write `faults_in_flight.md` and its JSON."""
     jobs = [(fault.name, seed) for fault in FAULTS for seed in range(1, MOMENTS + 1)]
     flown = computed(effort, "faults", jobs, _faulted, lambda r: r["end"] in END_STATES)
     out = Section("c_faults", "Faults in flight",
@@ -54,7 +54,7 @@ def fault_sections(effort: Effort) -> list[Section]:
 
 
 def comparison_sections(effort: Effort) -> list[Section]:
-    """All controllers on the same flights; writes `comparison.md` and `comparison.json`."""
+    """Return the comparison of all controllers on the same flights; write `comparison.md` and `comparison.json`."""
     seeds = range(1, 1 + (FULL_SEEDS if effort.full else QUICK_SEEDS))
     jobs = [(c, k, m, seed) for seed in seeds for m in MANEUVERS for k in CONDITIONS for c in CONTROLLERS]
     flown = computed(effort, "comparison", jobs, _compared, lambda r: r["outcome"] in ("held", "perched"))
@@ -93,7 +93,7 @@ def _no_way_out(r: dict[str, Any]) -> bool:
 
 
 def _told(r: dict[str, Any]) -> str:
-    """A flight without a good end."""
+    """Return the description of a flight without a safe end, as an item of a list."""
     height, gap, speed, tilt = r["before"]
     return (f"* **{r['fault']}**, seed {r['seed']}, {r['time']:.2f} s after the order to take off ({r['phase'].lower()}): {r['done']}. Then "
             f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg. "
@@ -111,7 +111,7 @@ def _searched(r: dict[str, Any]) -> str:
 
 
 def _rms(own: Sequence[dict[str, Any]]) -> np.ndarray:
-    """Of the flights that were begun, per axis [m], shape (3,)."""
+    """Return the RMS per axis of the errors of flights whose manoeuvre began [m], shape (3,)."""
     return np.sqrt(np.nanmean(np.square(np.array([r["rmse"] for r in own], float)), axis=0))
 
 

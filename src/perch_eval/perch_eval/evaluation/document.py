@@ -1,4 +1,4 @@
-"""The results as a page for people and as JSON for programs."""
+"""Output of the results: a Markdown page and a JSON file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: 
 
 
 def write(sections: Sequence[Section], effort: Effort, duration: float) -> None:
-    """Write `README.md` and `results.json` into the folder of the figures."""
+    """Write `README.md` and `results.json` into the folder of the results."""
     content = {**made_of(), "command": effort.command, "duration_s": duration, "machine": machine(), "sections": [
         {"key": s.key, "title": s.title, "about": s.about, "rows": [row.__dict__ for row in s.rows],
          "figures": [name for name, _ in s.figures], "data": s.data} for s in sections]}
@@ -24,19 +24,19 @@ def write(sections: Sequence[Section], effort: Effort, duration: float) -> None:
 
 
 def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, Any], data: str = "") -> None:
-    """A page among the results, with commit, command and machine below its heading, and its figures as JSON with the same; `data`: another name of these."""
+    """Write a page and its data as JSON, both with commit, command and machine; `data`: name of the JSON file, if not `name`."""
     made_by = [banner([commit()], [digest()]), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
     (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by, *lines[1:]]) + "\n")
     write_json(effort.out / f"{data or name}.json", {**made_of(), "command": effort.command, "machine": machine(), **content})
 
 
 def counts(sections: Sequence[Section]) -> Counter[str]:
-    """Rows by verdict."""
+    """Return the number of rows by verdict."""
     return Counter(row.verdict for section in sections for row in section.rows)
 
 
 def table(head: str, rows: Iterable[Sequence[object]]) -> list[str]:
-    """Lines of a table in Markdown: titles of the columns with a bar between each two, and rows of cells, in which bars are escaped."""
+    """Return the lines of a Markdown table. `head`: titles of the columns, separated by bars; bars in cells are escaped."""
     return [f"| {head} |", "| --- " * (head.count("|") + 1) + "|", *(f"| {' | '.join(map(_cell, row))} |" for row in rows)]
 
 
@@ -45,7 +45,7 @@ def _cell(value: object) -> str:
 
 
 def machine() -> str:
-    """What this runs on."""
+    """Return a description of this machine."""
     return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 

@@ -1,4 +1,4 @@
-"""The table of README.md: the papers' values beside ours, from docs/results, with their commit.
+"""Table of README.md: the papers' values beside ours, from docs/results, with the commit.
 
     python3 -m perch_eval.evaluation.front_page      write it into README.md
 """
@@ -24,15 +24,15 @@ ROWS = (
     ("perches on the cable, upside down", "p_table_1_flown", "180 deg: gripped the cable"),
     ("P, VI-A: collisions in random inspections", "p_inspection_layouts", "collisions"),
 )
-"""Title, key of the section, name of the row."""
+"""(Title, key of the section, name of the row) of each line."""
 BEGIN, END = "<!-- results: python3 -m perch_eval.evaluation.front_page -->\n", "<!-- end of results -->"
 
 
 def table() -> str:
-    """The table in Markdown; a row that the page does not have is said to be missing.
+    """Return the table in Markdown; rows that the page of results does not contain are marked as missing.
 
     Raises:
-        LookupError: the page does not say its commit.
+        LookupError: the page of results contains no commit.
     """
     page = Path("docs/results/README.md")
     rows = {(section["key"], row["name"]): row

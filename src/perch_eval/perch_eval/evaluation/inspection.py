@@ -1,4 +1,4 @@
-"""[P] Fig. 4 and 5: inspection with the line terms in the NMPC, and the same over random layouts. [P:VI-A]"""
+"""[P] Fig. 4 and 5: inspection with the line terms in the NMPC, in one flight and over random layouts. [P:VI-A]"""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GAIN = 5.0  # bar and paper: the mean reprojection error is cut by so much
 
 
 def inspection_sections(effort: Effort) -> list[Section]:
-    """Fig. 4 and 5 of one flight, and the same figures over random layouts."""
+    """Return Fig. 4 and 5 of one flight, and the same measures over random layouts."""
     return [_figures(effort), _layouts(effort)]
 
 
@@ -46,7 +46,7 @@ def _figures(effort: Effort) -> Section:
 
 
 def inspected(seed: int) -> dict[str, float]:
-    """The figures of one random layout, with and without the line terms; the seed is that of the layout and of the flight."""
+    """Return the measures of one random layout, with and without the line terms; the seed is used for layout and flights."""
     layout = random_layout(load_scenario(SCENARIO), seed)
     flown, blind = fly(layout, seed), fly(layout, seed, with_lines=False)
     return {"seed": seed, "reference_collisions": flown.reference.collisions, "collisions": flown.collisions,

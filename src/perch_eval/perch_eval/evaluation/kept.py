@@ -1,4 +1,4 @@
-"""Flights of an evaluation: those of the same code that an earlier one has flown are kept, so that an interrupted one goes on."""
+"""Flights of an evaluation, kept in a file: finished flights of the same code are reused, so that an evaluation can resume."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ T = TypeVar("T")
 
 def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], dict[str, Any]], good: Callable[[dict[str, Any]], bool],
              key: Callable[[T], str] = str, dead: Callable[[T], dict[str, Any]] | None = None) -> list[dict[str, Any]]:
-    """Figures of flights, a mapping each, in the order of the jobs.
+    """Return the figures of flights, one mapping per job, in the order of the jobs.
 
     Args:
-        effort: processes, and where results are kept.
-        name: of the file, and what is counted.
-        jobs: what is to be flown.
-        work: flies one job, in a process of its own.
-        good: what is counted as good on the way.
-        key: of a job in the file.
-        dead: figures of a job at which processes die again and again.
+        effort: number of processes, and folder of the kept figures.
+        name: name of the file, and of what the progress line counts.
+        jobs: jobs to be flown.
+        work: flies one job, in another process.
+        good: whether the figures count as good in the progress line.
+        key: returns the key of a job in the file.
+        dead: returns the figures of a job at which processes die repeatedly.
 
     Raises:
-        PerchError: processes die at a job, and there is no `dead`.
+        PerchError: processes die repeatedly at a job, and there is no `dead`.
     """
     effort.state.mkdir(parents=True, exist_ok=True)
     file = effort.state / f"{name}_{digest()}.jsonl"
@@ -51,7 +51,7 @@ def computed(effort: Effort, name: str, jobs: Sequence[T], work: Callable[[T], d
 
 
 def flown(effort: Effort, name: str, tasks: Sequence[Task], good: Callable[[RunResult], bool] = lambda r: r.cause == SUCCESS) -> list[RunResult]:
-    """Runs of a campaign's engine, which keep their numbers when others are added; arguments as those of `computed`."""
+    """Return the results of tasks, which are kept by run number; other arguments as those of `computed`."""
     found = computed(effort, name, tasks, _carried_out, lambda row: good(RunResult(**row)), lambda task: str(task.run.number),
                      lambda task: asdict(dead(task)))
     return [RunResult(**row) for row in found]

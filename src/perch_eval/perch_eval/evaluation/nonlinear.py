@@ -1,7 +1,7 @@
-"""The paper's comparison for Table I: one nonlinear program with the thrust bounded at every sample. [M:V, Table I]
+"""Comparison of the paper's Table I: one nonlinear program with the thrust bounded at every sample. [M:V, Table I]
 
-It solves in the coordinates of the paper's QP in which the equalities hold and the cost is |w|^2; in its coefficients it
-is slower still (8-60 s).
+The variables are the coordinates w of the paper's QP in which the equalities hold and the cost is |w|^2; with the Bernstein
+coefficients as variables the solver is slower (8-60 s).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ TIME_LIMIT = 120.0  # [s]
 
 @dataclass(frozen=True)
 class NonlinearPlan:
-    """Answer of the nonlinear program.
+    """Solution of the nonlinear program.
 
     Attributes:
         coefficients: Bernstein, shape (f, 3, degree + 1) [m].
         thrust_max: greatest thrust at the samples [N].
-        solve_time: CPU time, which other programs do not stretch [s].
-        converged: within tolerances before the time limit.
+        solve_time: CPU time, which does not depend on other processes [s].
+        converged: whether the solution is within tolerances, before the time limit.
     """
 
     coefficients: np.ndarray
@@ -39,11 +39,11 @@ class NonlinearPlan:
 
 
 def solve(program: Program, mass: float, thrust_max: float) -> NonlinearPlan:
-    """NLopt's SLSQP on the paper's program with the thrust bounded at every sample.
+    """Solve the paper's program with the thrust bounded at every sample by NLopt's SLSQP.
 
     Args:
-        program: of `paper_m.position_program`.
-        mass: of the vehicle [kg].
+        program: program from `paper_m.position_program`.
+        mass: mass of the vehicle [kg].
         thrust_max: bound [N].
     """
     begin = process_time()
@@ -85,7 +85,7 @@ def solve(program: Program, mass: float, thrust_max: float) -> NonlinearPlan:
 
 
 def _acceleration_map(program: Program, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Specific force at the samples as base + slopes @ w: shapes (samples, 3), (samples, 3, n)."""
+    """Return base and slopes of the specific force at the samples, base + slopes @ w: shapes (samples, 3), (samples, 3, n)."""
     origin = program.coefficients(np.zeros(n))
     base = _accelerations(origin, program.durations)
     slopes = np.stack([_accelerations(program.coefficients(unit) - origin, program.durations) for unit in np.eye(n)], axis=-1)
@@ -94,7 +94,7 @@ def _acceleration_map(program: Program, n: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def _accelerations(coefficients: np.ndarray, durations: np.ndarray) -> np.ndarray:
-    """Accelerations every `SAMPLE`, shape (samples, 3)."""
+    """Return accelerations at most `SAMPLE` apart [m/s^2], shape (samples, 3)."""
     out = []
     for segment, duration in zip(coefficients, durations):
         count = max(2, int(np.ceil(duration / SAMPLE)) + 1)

@@ -1,4 +1,4 @@
-"""[M] Tables II and III, Fig. 5 and 6: flights with rendered cameras, VIO, UKF, tags, planner, controller and contact."""
+"""[M] Tables II and III, Fig. 5 and 6: perching flights with rendered cameras and the complete software."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from perch_sim.scenario import load_scenario
 CONDITIONS = {"surface_60": (60, 1.7), "surface_90": (90, 1.7), "surface_60_far": (60, 3.0), "surface_90_far": (90, 3.0)}
 """Scenario -> inclination [deg] and distance [m]."""
 AGGRESSIVE = "surface_90_aggressive"
-"""Flown for the body rates of Fig. 6."""
+"""Scenario for the body rates of Fig. 6."""
 
 SUCCESSES = {"surface_60": 4, "surface_90": 4, "surface_60_far": 3, "surface_90_far": 4}  # of 5
 BARS = {"surface_60": 0.95, "surface_90": 0.95, "surface_60_far": 0.90, "surface_90_far": 0.90}  # with 100 seeds
@@ -43,13 +43,13 @@ PEAK_RATE, PEAK_ACCELERATION = 600.0, 10.0  # [deg/s], [m/s^2]
 
 
 def perching_sections(effort: Effort) -> list[Section]:
-    """Tables II and III, Fig. 5 and 6, and the proof that the engine flies what the real nodes fly."""
+    """Return Tables II and III, Fig. 5 and 6, and the comparison of the in-process engine with the real nodes."""
     groups = perches(effort)
     return [_errors(effort, groups), _successes(effort, groups), *_figures(effort, groups), _engines()]
 
 
 def perches(effort: Effort) -> dict[str, list[RunResult]]:
-    """The flights of each condition; finished ones of the same code are not flown again."""
+    """Return the flights of each condition; finished flights of the same code are not repeated."""
     jobs = enumerate(product(effort.seeds, (*CONDITIONS, AGGRESSIVE)))
     found = flown(effort, "flights", [Task(Run(number, seed, {"scenario": name}), extended_mapping("scenarios", name), "in_process", SENSING)
                                       for number, (seed, name) in jobs])
@@ -100,7 +100,7 @@ def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
 
 
 def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section]:
-    """Fig. 5 and 6 from the first seed at 90 deg, 1.7 m, with the figures of all seeds beside the paper's."""
+    """Return Fig. 5 and 6 from seed 1 at 90 deg, 1.7 m, and the values of all seeds beside the paper's."""
     five = Section("m_fig_5", "[M] Fig. 5: tracking, localisation and thrust at 90 deg, 1.7 m", "Seed 1; truth, estimate and reference.")
     six = Section("m_fig_6", "[M] Fig. 6: body rates at 90 deg, 1.7 m", f"The figure shows seed 1, the rows {_seeds(effort)}.")
     scenario = load_scenario("surface_90")
@@ -131,7 +131,7 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
 
 
 def _engines() -> Section:
-    """One flight on the real nodes against the same flight in process."""
+    """Compare one flight on the real nodes with the same flight in process."""
     from perch_eval.demo import fly as fly_on_the_stack
     from perch_eval.nodes import ALL_NODES
     from perch_eval.ros.recorded_flight import RecordedFlight

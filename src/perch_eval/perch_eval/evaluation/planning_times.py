@@ -1,4 +1,4 @@
-"""[M] Table I and Fig. 4: how long planning takes, and how the thrust shrinks while the time is stretched."""
+"""[M] Table I and Fig. 4: planning times, and the decrease of the thrust with time scaling."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ REPETITIONS = 5  # of each problem; the fastest counts, so that other work on th
 
 
 def waypoint_problem(rng: np.random.Generator, waypoints: int) -> PerchProblem:
-    """A wall 3 m away with random waypoints on the way, total time 1 s to begin with, as in the paper's experiment."""
+    """Return a problem as in the paper's experiment: a wall 3 m away, random waypoints, initial total time 1 s."""
     start, pad = np.array([0.0, 0.0, 1.2]), np.array([3.0, 0.0, 1.4])
     shares = np.linspace(0.0, 0.75, waypoints + 2)[1:-1]
     points = [start + s * (pad - start) + rng.normal(0.0, 0.25, 3) / math.sqrt(waypoints) for s in shares]
@@ -36,7 +36,7 @@ def waypoint_problem(rng: np.random.Generator, waypoints: int) -> PerchProblem:
 
 
 def planning_sections(effort: Effort) -> list[Section]:
-    """Table I and Fig. 4."""
+    """Return Table I and Fig. 4."""
     vehicle = load_vehicle("snapdragon")
     return [_table(effort, vehicle), _figure(effort, vehicle)]
 
@@ -76,7 +76,7 @@ def _table(effort: Effort, vehicle: Vehicle) -> Section:
 
 
 def _fastest(plan: Callable[..., Any], problem: PerchProblem, vehicle: Vehicle) -> Any:
-    """The fastest of several equal plans, or None where there is none."""
+    """Repeat a plan and return the fastest result, or None if planning is refused."""
     try:
         return min((plan(problem, SETTINGS, vehicle) for _ in range(REPETITIONS)), key=lambda found: found.solve_time)
     except PerchRefusal:
@@ -84,7 +84,7 @@ def _fastest(plan: Callable[..., Any], problem: PerchProblem, vehicle: Vehicle) 
 
 
 def _figure(effort: Effort, vehicle: Vehicle) -> Section:
-    """Fig. 4: thrust over time at each duration on the way to a plan that keeps its bound."""
+    """Return Fig. 4: thrust over time in each iteration until the plan keeps its bound."""
     bound = SETTINGS.thrust_max
     out = Section("m_fig_4", "[M] Fig. 4: the thrust shrinks while the time is stretched",
                   "A wall 3 m away from a hover, first duration 1 s, minimum snap; the time is stretched, as in the paper, until "
@@ -118,7 +118,7 @@ def _figure(effort: Effort, vehicle: Vehicle) -> Section:
 
 
 def _thrust(coefficients: np.ndarray, durations: np.ndarray, mass: float) -> tuple[np.ndarray, np.ndarray]:
-    """Thrust over time of the QP's solution for its durations."""
+    """Return times [s] and thrust [N] of the QP's solution, each of shape (n,)."""
     times, values, begin, s = [], [], 0.0, np.linspace(0.0, 1.0, 200)
     for segment, length in zip(coefficients, durations):
         a = bernstein.evaluate(bernstein.derivative(segment, 2), s).T / length**2

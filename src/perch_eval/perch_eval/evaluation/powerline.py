@@ -1,4 +1,4 @@
-"""[P] Table I, Fig. 6-8: plans past powerlines; what is flown is added where the parts exist."""
+"""[P] Table I and Fig. 6-8: plans of perches on powerlines, planning times, and errors of the flown perches."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PUBLISHED = {"deg90_published": 1.861, "upside_down_published": 2.485}  # durati
 
 
 def powerline_sections(effort: Effort) -> list[Section]:
-    """Table I with Fig. 6-8, and the published problems."""
+    """Return the planning times of Table I, the published problems, and Fig. 6-8."""
     return [_table(effort), _published(), *_pictures(effort)]
 
 
@@ -67,7 +67,7 @@ def _table(effort: Effort) -> Section:
 
 
 def flown_sections(effort: Effort) -> list[Section]:
-    """The errors at the perching point, flown."""
+    """Return the errors of the flown perches at the perching point."""
     seeds = effort.seeds_on_lines
     flown = "seed 1" if len(seeds) == 1 else f"seeds 1 to {seeds[-1]}"
     out = Section("p_table_1_flown", "[P] Table I: errors at the perching point",
@@ -129,7 +129,7 @@ def _published() -> Section:
 
 
 def _pictures(effort: Effort) -> list[Section]:
-    """Fig. 6 and 7 (80 deg without and with perception awareness) and Fig. 8 (upside down), as planned."""
+    """Return Fig. 6 and 7 (80 deg without and with perception awareness) and Fig. 8 (upside down), as planned."""
     seven = Section("p_fig_6_7", "[P] Fig. 6 and 7: the line in view at 80 deg", "Nominal start, as planned (flown: not available). No seed.")
     eight = Section("p_fig_8", "[P] Fig. 8: perching upside down", "Nominal start, as planned (flown: not available). No seed.")
     means = {}

@@ -1,4 +1,4 @@
-"""[P] Table I, the flown half: perches on lines, cameras rendered, and their errors at the perching point."""
+"""[P] Table I, flown part: perches on lines with rendered cameras, and their errors at the perching point."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ AROUND = 1.5  # the map is judged within this of the target point [m]
 
 
 def fly_line(task: Task) -> RunResult:
-    """One perch on a line, the same as by the real nodes, with the errors at the perching point among its metrics."""
+    """Fly one perch on a line, as with the real nodes; its metrics include the errors at the perching point."""
     return fly_in_process(task, _errors, linger=0.5)
 
 
@@ -43,35 +43,35 @@ def _errors(flight: Flight, scenario: Scenario, vehicle: Vehicle) -> dict[str, f
 
 
 def _target(scenario: Scenario) -> int:
-    """Index of the cable that the goal means."""
+    """Return the index of the cable nearest to the goal's perch point."""
     point = np.array(scenario.mission.perch_point)
     return int(np.argmin([CableLine(cable).nearest(point).distance for cable in scenario.world.cables]))
 
 
 def _others_touched(flight: Flight, scenario: Scenario) -> int:
-    """How often something else than the target was hit or gripped: another cable, or what is no cable, in flight."""
+    """Return the number of contacts with cables other than the target."""
     target, states = f"cable {_target(scenario)}", (1, 2, 3)
     return sum(c.state in states and c.body.startswith("cable") and c.body != target for _, c in flight.values("contact"))
 
 
 def _perches(flight: Flight) -> list[tuple[float, TrajectoryOrder]]:
-    """The planned perches, in order."""
+    """Return (time [s], order) of the planned perches."""
     return [(t, order) for t, order in flight.values("trajectory")
             if order.contact_after is not None and isinstance(order.trajectory, SampledTrajectory)]
 
 
 def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> dict[str, float | None]:
-    """Errors when the perch ends, or when the gripper closes before.
+    """Return the errors at the planned end of the perch, or at the gripper's closing if that is earlier.
 
     Args:
-        flight: what was flown.
-        scenario: where the wires truly are.
-        wire_offset: centre of mass from the wire's axis where the plan ends [m].
+        flight: the flight.
+        scenario: scenario with the true wires.
+        wire_offset: distance of the centre of mass from the wire's axis at the end of the plan [m].
 
     Returns:
-        `perching_position_m`: across the wire, of the body's true place against the true wire from its planned place against the
-        planned one; `perching_in_map_m`: of the true place in map from the planned one, odometry's drift included;
-        `perching_tilt_deg`: angle between the b3 axes. None where the flight did not get there.
+        `perching_position_m`: position error across the wire, true position relative to the true wire minus planned position
+        relative to the planned wire; `perching_in_map_m`: true minus planned position in map, including the odometry's drift;
+        `perching_tilt_deg`: angle between the true and the planned b3. None if the flight did not reach the perching point.
     """
     none: dict[str, float | None] = {"perching_position_m": None, "perching_in_map_m": None, "perching_tilt_deg": None}
     plans, truth = _perches(flight), flight.states("ground_truth/odometry")
@@ -99,11 +99,11 @@ def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> d
 
 
 def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None]:
-    """Mean distance of the mapped target wire from the true one within `AROUND` of the target point, when the first plan is flown.
+    """Return the mean distance of the mapped target wire from the true one within `AROUND` of the target, at the first plan.
 
     Returns:
-        `mapping_in_map_m`: of both in map, odometry's drift included; `mapping_m`: as the vehicle sees them, the mapped one from
-        its estimated pose and the true one from its true pose.
+        `mapping_in_map_m`: distance in map, including the odometry's drift; `mapping_m`: distance relative to the vehicle, the
+        mapped wire seen from the estimated pose and the true wire from the true pose. None if there is no such map.
     """
     none: dict[str, float | None] = {"mapping_m": None, "mapping_in_map_m": None}
     plans = _perches(flight)
@@ -126,12 +126,12 @@ def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None
 
 
 def recovered(run: RunResult) -> bool:
-    """Whether a flight that did not grip came to a hover."""
+    """Return whether a flight that did not grip ended in a hover."""
     return run.outcome == "missed" and run.cause != "crash" and run.message.endswith("hover")
 
 
 def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], list[RunResult]]:
-    """Flights of each case by (case, whether the gripper works); finished ones of the same code are not flown again."""
+    """Return the flights by (case, whether the gripper works); finished flights of the same code are not repeated."""
     tasks = []
     jobs = [(seed, case, grips) for seed in effort.seeds_on_lines for grips in (True, False) for case in cases
             if grips or case in WITHOUT_GRIP and seed <= SEEDS_WITHOUT_GRIP]

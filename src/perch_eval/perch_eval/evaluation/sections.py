@@ -1,4 +1,4 @@
-"""What a part of the evaluation hands over: rows beside the paper's values, figures, and a verdict on each row."""
+"""Result of a part of the evaluation: rows beside the paper's values, a verdict on each row, and figures."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ class Row:
     """One line of a table.
 
     Attributes:
-        name: what was measured.
+        name: name of the measured quantity.
         ours: our value, with interval or range.
-        paper: the paper's value; empty: it gives none.
-        verdict: `holds` or `FAILS` for a claim, `vacuous` for one about nothing that occurred, `better` / `worse` for a
-            comparison without a claim, `shown`, `not available` where the part does not exist.
-        note: what the claim is, or why it is not available.
+        paper: the paper's value; empty: the paper gives none.
+        verdict: `holds` or `FAILS` for a claim, `vacuous` for a claim about cases that did not occur, `better` or `worse` for a
+            comparison without a claim, `shown`, or `not available` if there is no value.
+        note: the claim, a remark, or the reason why there is no value.
     """
 
     name: str
@@ -34,12 +34,12 @@ class Section:
     """One table or figure of a paper.
 
     Attributes:
-        key: short name, also that of its files.
+        key: short name, in the JSON file.
         title: heading.
-        about: what was done, seeds included.
-        rows: the table.
-        figures: (file name, caption), in the folder of the results.
-        data: figures behind the rows, for the JSON file.
+        about: description of the experiment, including the seeds.
+        rows: rows of the table.
+        figures: (file name, caption) of the figures, in the folder of the results.
+        data: values behind the rows, for the JSON file.
     """
 
     key: str
@@ -50,36 +50,36 @@ class Section:
     data: dict = field(default_factory=dict)
 
     def claim(self, name: str, ours: str, paper: str, holds: bool | None, note: str) -> None:
-        """A row that says whether a claim holds; None: there was nothing that it could be tested on."""
+        """Add a row with the verdict on a claim; None: there was no case to test it on."""
         self.rows.append(Row(name, ours, paper, VACUOUS if holds is None else HOLDS if holds else FAILS, note))
 
     def compare(self, name: str, ours: str, paper: str, better: bool, note: str = "") -> None:
-        """A row that compares without claiming."""
+        """Add a row that compares our value with the paper's without a claim."""
         self.rows.append(Row(name, ours, paper, BETTER if better else WORSE, note))
 
     def show(self, name: str, ours: str, paper: str = "", note: str = "") -> None:
-        """A row without a judgement."""
+        """Add a row without a verdict."""
         self.rows.append(Row(name, ours, paper, SHOWN, note))
 
     def missing(self, name: str, paper: str, why: str) -> None:
-        """A row whose part does not exist."""
+        """Add a row without a value."""
         self.rows.append(Row(name, "-", paper, MISSING, why))
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is spent.
+    """Extent of an evaluation.
 
     Attributes:
-        full: every part, and more problems in those that only compute.
-        jobs: processes for flights.
+        full: more planning problems and seeds of the comparison; by default also every part.
+        jobs: number of processes for flights.
         out: folder of the results.
-        state: folder of what an interrupted evaluation resumes from.
-        command: what regenerates the page.
-        fresh: forget what an earlier evaluation has done.
-        seeds: of the flights of each perch condition.
-        seeds_on_lines: of the flights of each powerline scenario.
-        layouts: random layouts of the inspection.
+        state: folder of the finished flights from which an interrupted evaluation resumes.
+        command: command that regenerates the page.
+        fresh: repeat flights that an earlier evaluation has finished.
+        seeds: seeds of the flights of each perch condition.
+        seeds_on_lines: seeds of the flights of each powerline scenario.
+        layouts: number of random layouts of the inspection.
     """
 
     full: bool

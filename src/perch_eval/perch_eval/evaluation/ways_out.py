@@ -1,4 +1,4 @@
-"""Ways out of planned perches: from each instant of a plan to a hover, and flights that are cancelled on the way."""
+"""Ways out of planned perches: trajectories from each instant of a plan to a hover, and flights that are cancelled on the way."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ BAR = 0.99                                                # share of the instant
 
 
 class Instant(NamedTuple):
-    """A state of a plan: time to contact [s], and why there is no way out of it; empty: there is one."""
+    """Instant of a plan: time to contact [s], and the reason why there is no way out from its state; empty: there is one."""
 
     left: float
     refusal: str
 
 
 def sections(effort: Effort) -> list[Section]:
-    """Share of instants with a way out, and cancelled flights; writes `way_out.md` and `way_out.json`."""
+    """Return the share of instants with a way out and the cancelled flights; write `way_out.md` and `way_out.json`."""
     out = Section("c_way_out", "Ways out of planned perches",
                   f"Each plan is asked {RATE:g} times a second for a way out: a trajectory from its state at that time to a hover, with all limits "
                   f"proved (surfaces) or checked at 1 ms (powerlines). Surfaces: {PLANS} plans each, 1.2 to 3 m away, by the planner as shipped; "
@@ -96,12 +96,12 @@ def sections(effort: Effort) -> list[Section]:
 
 
 def _share(instants: Sequence[Instant]) -> str:
-    """How many of them have a way out."""
+    """Return how many of the instants have a way out, as text."""
     return f"{sum(not x.refusal for x in instants)} of {len(instants)}"
 
 
 def _aborts() -> Iterator[tuple[str, int, float]]:
-    """Scenario, seed, and time before the contact [s]."""
+    """Yield scenario, seed, and time of cancellation before the contact [s]."""
     for name, n in FLOWN.items():
         for k in range(n):
             yield name, k + 1, round(EARLIEST * (1.0 - (k + 0.5) / n), 3)
@@ -112,7 +112,7 @@ def _flown(job: tuple[str, int, float]) -> dict[str, Any]:
 
 
 def _planned(job: tuple[str, int]) -> dict[str, Any]:
-    """The instants of one plan."""
+    """Compute the instants of one plan, or the reason for which it was refused."""
     name, seed = job
     rng = np.random.default_rng(seed)
     try:
@@ -147,7 +147,7 @@ def _line(name: str, seed: int, rng: np.random.Generator) -> list[Instant]:
 
 
 def _instants(duration: float, way_out: Callable[[float], object]) -> list[Instant]:
-    """Those of a plan, each asked for its way out, which may be refused."""
+    """Return the instants of a plan; `way_out` is called with the time since its start [s] and raises where it is refused."""
     found = []
     for t in np.arange(0.0, duration, 1.0 / RATE).tolist():
         try:

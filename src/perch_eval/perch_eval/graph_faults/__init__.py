@@ -1,1 +1,1 @@
-"""Faults on the real graph: processes are killed, stopped and restarted, messages are delayed, dropped, duplicated and reordered."""
+"""Faults on the real graph: processes killed, stopped or restarted, messages delayed, dropped, duplicated or reordered."""

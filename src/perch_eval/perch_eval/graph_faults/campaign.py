@@ -1,4 +1,4 @@
-"""The campaign of faults on the real graph: flies what has not been flown yet, and writes the page."""
+"""Campaign of faults on the real graph: fly the cases that have no result yet, and write the page of results."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FALL = 1.5  # speed beyond which an end on the floor is a fall [m/s]
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     out = command_parser("faults.py", __doc__, EXAMPLES)
     out.add_argument("--out", type=Path, default=Path("docs/results/faults"), metavar="DIR", help="rows and page (default: %(default)s)")
     out.add_argument("--logs", type=Path, default=Path("out/faults"), metavar="DIR", help="logs of the flights (default: %(default)s)")
@@ -67,11 +67,11 @@ def _strike(args: argparse.Namespace) -> int:
 
 
 def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
-    """The rows flown so far, the last of each case; a line that was cut off, or a flight that ended before its fault, does not count.
+    """Return the last row of each case flown so far; truncated lines, and flights that ended before their fault, do not count.
 
     Args:
-        file: a row a line.
-        code: digest of the code whose rows count; None: any.
+        file: file with one row per line.
+        code: digest of the code whose rows count; None: any code.
     """
     found = {}
     for row in rows_of(file):
@@ -81,11 +81,11 @@ def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
 
 
 def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, dict[str, Any]], jobs: int) -> None:
-    """Fly cases, `jobs` at a time in lockstep, then one by one in real time: two flights have too little processor time on two cores.
-    Each is kept when it has been flown.
+    """Fly cases: `jobs` at a time in lockstep, then one by one in real time, as parallel real-time flights lack processor time.
+    Each row is written when its flight has ended.
 
     Raises:
-        PerchError: the process of a flight has died again and again.
+        PerchError: the process of a flight died repeatedly.
     """
     with closing(Rows(file, rows.values())) as kept, closing(Progress(len(missing), what="flights")) as progress:
         for mode, at_once in ((LOCKSTEP, jobs), (REAL_TIME, 1)):
@@ -99,7 +99,7 @@ def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, di
 
 
 def _fly(logs: Path, case: Case) -> dict[str, Any] | str:
-    """The row of a flight, or why there is none."""
+    """Fly a case; return its row, or the reason why it was not flown."""
     folder = logs / case.name.replace(", ", "_").replace(" ", "_")
     for old in folder.glob("*.log"):
         old.unlink()
@@ -111,7 +111,7 @@ def _fly(logs: Path, case: Case) -> dict[str, Any] | str:
 
 
 def problems(row: dict[str, Any]) -> list[str]:
-    """What is not as it should be in a flight."""
+    """Return the problems of a flight; empty: none."""
     if row["struck"] is None:
         return [f"the flight ended before the fault: {row['goal']}"]
     found = [] if row["end"] in SAFE else [f"ended {row['end']}"]
@@ -122,7 +122,7 @@ def problems(row: dict[str, Any]) -> list[str]:
 
 
 def tolerated(row: dict[str, Any]) -> bool:
-    """Whether messages were disturbed and nobody said so in time, as nothing came of it: the flight perched."""
+    """Return whether disturbed messages were not reported in time, but had no effect: the flight perched."""
     return row["fault"] in TRAFFIC and row["goal"].startswith("perched") and (row["named"] is None or row["named"] > NAMED)
 
 
@@ -132,7 +132,7 @@ def _ends(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def page(rows: Sequence[dict[str, Any]]) -> str:
-    """The page of what has been flown."""
+    """Return the page of results in Markdown."""
     struck = [row for row in rows if row["struck"] is not None]
     lost = Counter(row["node"] for row in struck if row["impact"] > FALL and row["end"] in SAFE)
     safe = [row for row in struck if row["end"] in SAFE]

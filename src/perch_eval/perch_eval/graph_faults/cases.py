@@ -1,4 +1,4 @@
-"""Which faults strike which node when, and what counts as a safe and named end."""
+"""Cases of the campaign: fault, node, phase and mode; criteria for a safe end and for a reported fault."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ TALKERS = {
     "controller": ("motor_command", "controller/status"),
     "mission": ("trajectory", "controller/command"),
 }
-"""Whose messages are disturbed, in real time: node -> channels. The planner answers requests, it publishes nothing that others take."""
+"""Channels that are disturbed in real time, by publishing node. The planners answer requests and publish nothing that is used."""
 PHASES = ("climb", "search", "approach", "contact", "perched")
 LOCKSTEP, REAL_TIME = "lockstep", "real time"
 MODES = (LOCKSTEP, REAL_TIME)
 SAFE = ("hovering", "landed", "perched", "motors off")
-"""Ends that are safe; `motors off`: on the ground, after a fall or lying there."""
+"""Safe ends; `motors off`: on the ground, tilted by 20 deg or more, motors off."""
 NAMED = 5.0  # wall-clock time from the fault within which it is named [s]
 
 WORDS = {
@@ -46,16 +46,16 @@ WORDS = {
     "controller": r"controller|motor_command|disarmed",
     "mission": r"\bmission\b",
 }
-"""What says who, or whose messages, are missing: the node's name, or a channel that is its own."""
+"""Patterns that identify a struck node in a message: its name, or a channel that it publishes."""
 _TROUBLE = re.compile(r"\b(no|not|never|lost|gone|silent|waiting|without|refused|stopped|missed|descen\w+|landing|ended|dropped|"
                       r"restarted|back)\b", re.IGNORECASE)
 _ROUTINE = re.compile(r"looking for the target|waiting for the estimator$")
-"""What the mission tells of every flight."""
+"""Messages that the mission sends in every flight; they do not report a fault."""
 _LINE = re.compile(r"\[(?P<level>[A-Z]+)\] \[(?P<time>\d{9,}\.\d+)\] \[(?P<node>[\w.]+)\]: (?P<text>.*)")
 
 
 class Case(NamedTuple):
-    """One fault."""
+    """One case: a fault of a node in a phase of a flight."""
 
     fault: str
     node: str
@@ -64,17 +64,17 @@ class Case(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For files and people."""
+        """Name of the case, in pages and files."""
         return f"{self.fault} {self.node}, {self.phase}, {self.mode}"
 
     @property
     def seed(self) -> int:
-        """Of the flight, and of the moment within the phase."""
+        """Seed of the flight, and of the time of the fault within the phase."""
         return int(self._digest[:7], 16)
 
     @property
     def alone(self) -> bool:
-        """Whether every node has a process of its own; otherwise the struck one has, and most of the others share one, as in `demo.py`."""
+        """Whether every node has its own process; otherwise the struck one has, and most others share one, as in `demo.py`."""
         return self.seed % 4 == 0
 
     @property
@@ -83,22 +83,22 @@ class Case(NamedTuple):
 
 
 def cases() -> list[Case]:
-    """All of them, so mixed that the first n are a sample of all."""
+    """Return all cases in a fixed, mixed order, so that the first n are a sample of all."""
     found = [Case(*one) for one in product(PROCESS, NODES, PHASES, MODES)]
     found += [Case(fault, node, phase, REAL_TIME) for fault, node, phase in product(TRAFFIC, TALKERS, ("search", "approach"))]
     return sorted(found, key=lambda case: case._digest)
 
 
 class Situation(NamedTuple):
-    """The vehicle at one moment, by the truth.
+    """True situation of the vehicle at one time.
 
     Attributes:
-        height: of the centre of mass above where it stood before the flight [m].
+        height: height of the centre of mass above its place before the flight [m].
         speed: [m/s].
         tilt: [deg].
-        rotors: of the fastest one [rad/s].
-        held: velcro or gripper holds.
-        hovers: the controller says so.
+        rotors: speed of the fastest rotor [rad/s].
+        held: whether velcro or gripper holds the vehicle.
+        hovers: whether the controller reports a hover.
     """
 
     height: float
@@ -110,7 +110,7 @@ class Situation(NamedTuple):
 
 
 def ending(now: Situation) -> str:
-    """How a flight has ended, by the truth; for a hover the controller's word is needed, too."""
+    """Return the end of a flight by the true situation; a hover also requires the controller's state."""
     if now.held and now.speed < 0.1 and now.rotors < 50.0:
         return "perched"
     if now.rotors < 50.0 and now.height < 0.15 and now.speed < 0.1:
@@ -121,13 +121,13 @@ def ending(now: Situation) -> str:
 
 
 def named(case: Case, struck: float, lines: Iterable[str], said: Iterable[tuple[float, str]]) -> tuple[float, str] | None:
-    """When after the fault [s], and by which words, who and what it is was said; None: never.
+    """Return the delay [s] and text of the first report that names the struck node or its messages; None: there is none.
 
     Args:
-        case: the fault; the node that it strikes is no witness.
-        struck: when, seconds since the epoch.
-        lines: of all logs, each with level, seconds since the epoch, node.
-        said: (seconds since the epoch, words) of who sent the goal.
+        case: the case; log lines of the struck node itself do not count.
+        struck: time of the fault, seconds since the epoch.
+        lines: lines of all logs, each with level, seconds since the epoch and node.
+        said: (seconds since the epoch, text) received by the pilot, which sent the goal.
     """
     words = re.compile(WORDS[case.node], re.IGNORECASE)
     found = [(time - struck, f"pilot: {text}") for time, text in said

@@ -1,4 +1,4 @@
-"""One flight on the real graph with one fault: a process for the node that is struck, no cameras, a pilot that sends the goal."""
+"""One flight on the real graph with one fault. The struck node has its own process; no cameras; a pilot sends the goal."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ name: surface_90_blind
 nodes: [vehicle, vio_model, estimator, target_localizer, perching_planner, controller, mission]
 parameters: {perching_planner: {time_limit: 20.0}, mission: {mission.plan_lead: 1.5}, vehicle: {lockstep_timeout: 8.0}}
 """
-"""What is flown: without images. A busy machine may take its time to plan, 1.5 s instead of 0.1; the lockstep goes on without a node
-that hangs after 8 s instead of 60."""
+"""Scenario of the flights, without images. Plans begin 1.5 s after their request instead of 0.1 s, for a busy machine; the
+lockstep drops a node that hangs after 8 s instead of 60 s."""
 DOMAINS = range(43, 70)
 READY = 60.0     # for the nodes to come up [s]
 STALL = 30.0     # simulation time may stand still for so long [s]
@@ -42,21 +42,21 @@ NEAR = 0.15      # of the centre of mass from the pad: the contact begins [m]
 
 @dataclass(frozen=True)
 class Row:
-    """How a flight went.
+    """Result of one flight.
 
     Attributes:
-        fault, node, phase, mode, seed: what was done.
-        commit: of the code.
+        fault, node, phase, mode, seed: the case.
+        commit: commit of the code.
         struck: simulation time of the fault [s]; None: the flight ended before.
-        before: height [m], speed [m/s] and tilt [deg] then.
-        end: hovering, landed, perched, motors off; anything else is not safe.
-        named: after so many seconds of wall-clock time the fault was named; None: never.
-        words: by whom, and how.
-        goal: the mission's result, or what the pilot knows of it.
-        impact: fastest touch of the floor or a wall after the fault [m/s].
+        before: height [m], speed [m/s] and tilt [deg] at the fault.
+        end: hovering, landed, perched or motors off; any other end is not safe.
+        named: wall-clock time from the fault to its first report [s]; None: it was not reported.
+        words: source and text of that report.
+        goal: the mission's result, or the pilot's error message.
+        impact: largest normal speed of a contact with the floor or a wall after the fault [m/s].
         ended: other nodes that ended by themselves.
-        left: processes, sockets, shared memory that were left when all had been stopped.
-        duration: wall clock [s].
+        left: processes, sockets and shared memory that remained after all nodes were stopped.
+        duration: wall-clock time of the flight [s].
     """
 
     fault: str
@@ -78,12 +78,13 @@ class Row:
 
 
 class _Director:
-    """Waits for the moment, and makes the fault happen.
+    """Applies the fault at its time.
 
     Attributes:
-        struck: when, seconds since the epoch; None: not yet.
+        said: (seconds since the epoch, text) received by the pilot.
+        struck: time of the fault, seconds since the epoch; None: not yet.
         at: the same in simulation time [s].
-        before: the situation then.
+        before: situation at the fault.
     """
 
     def __init__(self, case: Case, group: Group, watcher: Watcher, takeoff_height: float, pad: Any) -> None:
@@ -97,7 +98,7 @@ class _Director:
         self.before = Situation(0.0, 0.0, 0.0, 0.0, False, False)
 
     def on_phase(self, t: float, phase: str, message: str) -> None:
-        """Of the mission's feedback; what is said otherwise is kept, too."""
+        """Receive feedback of the goal: keep every message, and the start and duration of the mission's phases."""
         self.said.append((time.time(), message))
         if phase != self._phase and phase not in ("waiting", "cancelling"):
             self._phase, self._since = phase, self._watcher.time
@@ -105,7 +106,7 @@ class _Director:
             self._duration = float(planned[1]) if planned else self._duration
 
     def look(self) -> None:
-        """Strike, if it is time."""
+        """Apply the fault if its time has come."""
         if self.struck is not None or not self._now():
             return
         case, group = self._case, self._group
@@ -123,10 +124,10 @@ class _Director:
                 group.start(case.node)
 
     def follow(self) -> None:
-        """As `look`, while the goal is awaited.
+        """Like `look`, while the pilot waits for the goal's end.
 
         Raises:
-            PerchError: the mission does not run any more, and the fault has had its time to be named; nobody else answers to the goal.
+            PerchError: the mission was killed or stopped, and the time to report that is over; the goal will not be answered.
         """
         self.look()
         if self._case.node == "mission" and self._case.fault in ("kill", "stop") and self.struck is not None and self.told:
@@ -134,7 +135,7 @@ class _Director:
 
     @property
     def told(self) -> bool:
-        """Whether what has been struck has had its time to be named."""
+        """Whether the time to report the fault is over, or there was no fault yet."""
         return self.struck is None or time.time() - self.struck > NAMED + 0.5
 
     def _now(self) -> bool:
@@ -154,12 +155,12 @@ def fly(case: Case, folder: Path, commit: str) -> Row:
     """Fly one case.
 
     Args:
-        case: what happens.
+        case: case to be flown.
         folder: receives scenario, parameters and logs.
-        commit: of the code, for the row.
+        commit: commit of the code, for the row.
 
     Raises:
-        PerchError: the nodes do not come up.
+        PerchError: the nodes did not start.
     """
     began = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
@@ -201,7 +202,7 @@ def fly(case: Case, folder: Path, commit: str) -> Row:
 
 
 def _settled(pilot: MissionClient, watcher: Watcher, director: _Director) -> str:
-    """Wait until an end lasts, and the fault has had its time to be named."""
+    """Wait until an end lasts and the time to report the fault is over; return the end."""
     limit, since, last = time.monotonic() + LIMIT, watcher.time, ""
     while time.monotonic() < limit:
         pilot.spin(0.05)

@@ -1,4 +1,4 @@
-"""The processes of one flight with a fault: who has one, and what they leave behind."""
+"""Processes of one flight with a fault: start, signals, end, and what they leave behind."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ NICE = 10        # of flights in lockstep: those in real time go first
 
 
 class Group:
-    """The processes of one flight.
+    """Processes of one flight.
 
     Attributes:
-        pids: process -> id of the present one; its name is that of its node, or `composed`.
-        nodes: fully qualified names.
+        pids: name of the process (its node, or `composed`) -> its present id.
+        nodes: fully qualified names of the nodes.
     """
 
     def __init__(self, launches: tuple[NodeLaunch, ...], case: Case, folder: Path, domain: int) -> None:
         """
         Args:
-            launches: the nodes.
-            case: says who has a process, and whose messages pass the relay.
+            launches: nodes of the flight.
+            case: determines which nodes have their own process, and which messages pass the relay.
             folder: receives parameters and logs.
             domain: ROS domain.
         """
@@ -58,7 +58,7 @@ class Group:
         self._before = of_ports(domain)
 
     def start(self, name: str) -> None:
-        """Start a node, for the first time or again."""
+        """Start or restart a process."""
         what, arguments = self._commands[name]
         pid = start(what, arguments, self._folder / f"{name}.log", {"ROS_DOMAIN_ID": str(self._domain)}, "perch_eval.graph_faults.preload")
         os.setpriority(os.PRIO_PROCESS, pid, self._nice)
@@ -66,25 +66,25 @@ class Group:
         self._sessions.append(pid)
 
     def start_all(self) -> None:
-        """Start all nodes."""
+        """Start all processes."""
         for name in self._commands:
             self.start(name)
 
     def signal(self, name: str, number: signal.Signals) -> None:
-        """Send a signal to a node."""
+        """Send a signal to a process."""
         self._memory.observe(self.pids.values())
         os.kill(self.pids[name], number)
 
     def ended(self) -> tuple[str, ...]:
-        """Nodes whose processes have ended."""
+        """Return the names of processes that have ended."""
         return tuple(name for name, pid in self.pids.items() if not alive(pid))
 
     def lines(self) -> list[str]:
-        """Everything that was written."""
+        """Return the lines of all logs."""
         return [line for name in self._commands for line in (self._folder / f"{name}.log").read_text(errors="replace").splitlines()]
 
     def stop(self) -> None:
-        """End everything. The pilot must still be there: shared memory of this process is cleaned, too, when it has left."""
+        """End all processes. Call it before the pilot is closed, so that the pilot's shared memory is cleaned, too."""
         self._memory.observe((*self.pids.values(), os.getpid()))
         running = [pid for pid in self.pids.values() if alive(pid)]
         for number, patience in zip((signal.SIGINT, signal.SIGKILL), STOPPING):
@@ -98,7 +98,7 @@ class Group:
                 time.sleep(0.02)
 
     def left(self) -> tuple[str, ...]:
-        """What is left when all have been stopped, the pilot included, in words; shared memory is cleaned first."""
+        """Clean shared memory and return what remains, as text. All processes must be stopped and the pilot closed."""
         end = time.monotonic() + GOING
         while True:  # threads of a process that has ended may hold what it had open for a moment
             self._memory.clean()
@@ -113,7 +113,7 @@ class Group:
         return [f"socket {line.split()[-1]}" for line in Path("/proc/net/unix").read_text().splitlines() if mine in line]
 
     def _shared_memory(self) -> list[str]:
-        """Segments of these processes, or of a port of their domain, that no process uses any more or whose maker has ended."""
+        """Return segments of these processes, or of a port of their domain, that are unused or whose creator has ended."""
         ports = of_ports(self._domain) - self._before  # other ports are shared with other domains
         found = ports | {Path(name) for name in self._memory.seen if Path(name).exists() and not PORT.match(Path(name).name)}
         unused = SharedMemory().unused(map(segment, found))

@@ -1,6 +1,6 @@
-"""What the fork server of these flights loads: the code of every node, and with a flight in process the compiled kernels.
+"""Preload for the fork server of these flights: the code of every node and, by a flight in process, the compiled kernels.
 
-It works when it is imported: that is all that a fork server can be told to do.
+The work is done on import, as a fork server can only import modules.
 """
 
 from __future__ import annotations

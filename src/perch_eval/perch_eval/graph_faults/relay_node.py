@@ -1,8 +1,8 @@
-"""Passes messages on, and disturbs them when it is told to: a node publishes on `direct/<channel>`, and the others hear this one.
+"""Relay that forwards messages and disturbs them on request: the node publishes on `direct/<channel>`, subscribers use the relay.
 
     python3 -m perch_eval.graph_faults.relay_node odometry estimator/status --ros-args
 
-A message on `relay/fault` (std_msgs/String) is what is done from then on: delay, drop, duplicate, reorder, or nothing.
+A message on `relay/fault` (std_msgs/String) sets the disturbance: delay, drop, duplicate or reorder; others forward unchanged.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PERIOD = 0.002  # between looks for what is due [s]
 
 
 class Disturbance:
-    """What becomes of the messages of one channel."""
+    """Disturbance of the messages of one channel."""
 
     def __init__(self, seed: int = 1) -> None:
         self.fault = ""
@@ -40,7 +40,7 @@ class Disturbance:
         self._late: deque[tuple[float, Any]] = deque()
 
     def passed(self, message: Any, now: float) -> list[Any]:
-        """What goes on when a message comes, at a time of the monotonic clock [s]."""
+        """Return the messages to forward when a message arrives, at a time of the monotonic clock [s]."""
         if self.fault == "delay":
             self._late.append((now + DELAY, message))
             return []
@@ -57,7 +57,7 @@ class Disturbance:
         return [message]
 
     def due(self, now: float) -> list[Any]:
-        """What was delayed until now."""
+        """Return the delayed messages that are due at a time of the monotonic clock [s]."""
         found = []
         while self._late and self._late[0][0] <= now:
             found.append(self._late.popleft()[1])
@@ -65,7 +65,7 @@ class Disturbance:
 
 
 class RelayNode(Node):
-    """One disturbance for each channel."""
+    """Node that relays channels, with one disturbance for each."""
 
     def __init__(self, channels: list[str]) -> None:
         super().__init__("relay")
@@ -96,7 +96,7 @@ class RelayNode(Node):
 
 
 def main() -> None:
-    """Pass on the channels of the command line until SIGINT or SIGTERM."""
+    """Relay the channels of the command line until SIGINT or SIGTERM."""
     end = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
     stop = StopSignal()
     join(sys.argv)

@@ -1,1 +1,1 @@
-"""What a vehicle answers to its commands, from a flight: lags, delay and gains of its inner loop, thrust, drag."""
+"""Identification of a vehicle from a flight: lags, delay and gains of its inner loop, thrust, drag."""

@@ -1,4 +1,4 @@
-"""Commands to an inner loop and their answers: measured, by a model, and drawn."""
+"""Responses of an inner loop to its commands: measured, modelled and plotted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from perch_eval.metrics import perch_window
 
 @dataclass(frozen=True)
 class Answer:
-    """A command and its answer over time, for the page: title, unit, t [s], command, measured, model, each (n,)."""
+    """Command and response over time, for plots: t [s], command, measured and modelled response, each (n,), in `unit`."""
 
     title: str
     unit: str
@@ -28,13 +28,13 @@ class Answer:
 
     @property
     def explained(self) -> float:
-        """Share of the measured variance, after the noise between neighbouring samples, that the model explains."""
+        """Share of the measured variance that the model explains, without the noise between neighbouring samples."""
         error, noise = self.measured - self.model, 0.5 * float(np.mean(np.diff(self.measured) ** 2))
         return 1.0 - max(float(np.var(error)) - noise, 0.0) / max(float(np.var(self.measured)) - noise, 1e-12)
 
 
 def lagged(u: np.ndarray, lag: float, period: float) -> np.ndarray:
-    """First-order lag of a command given at each sample, (n, ...), and its mean from one to the next; it begins settled."""
+    """Return the response of a settled first-order lag to commands (n, ...), with the mean of two samples between them."""
     from scipy.signal import lfilter  # 0.3 s of imports, which a report without an inner loop does without
 
     fade = exp(-period / max(lag, 1e-6))
@@ -43,11 +43,11 @@ def lagged(u: np.ndarray, lag: float, period: float) -> np.ndarray:
 
 
 def answers_figure(answers: Sequence[Answer], names: Sequence[str] = ()) -> Figure:
-    """One row per answer: command, measured and model over time, and beside it measured over model.
+    """Plot one row per response: command, measurement and model over time, and beside it measurement over model.
 
     Args:
-        answers: what is drawn.
-        names: of the models; by default how much of the measured variance each explains.
+        answers: responses to plot.
+        names: labels of the models; by default the share of the measured variance that each explains.
     """
     figure = Figure(figsize=(13, 2.8 * len(answers)), layout="constrained")
     axes = figure.subplots(len(answers), 2, squeeze=False, gridspec_kw={"width_ratios": [4, 1]})
@@ -69,10 +69,10 @@ def answers_figure(answers: Sequence[Answer], names: Sequence[str] = ()) -> Figu
 
 
 def inner_loop_figure(flight: Flight, vehicle: Vehicle) -> Figure | None:
-    """Commands of rates and thrust through the perch, what the IMU reads, and the answer of the model that the vehicle file has.
+    """Plot commanded rates and thrust during the perch, the IMU's measurements, and the response by the vehicle file's model.
 
     Returns:
-        None where the vehicle takes no rates, or the flight has none.
+        The figure; None if the flight has no rate commands, IMU samples or perch.
     """
     sent = [(t, c) for t, c in flight.values("rates_thrust_command") if c.armed]
     imu, window = flight.values("imu/data_raw"), perch_window(flight)

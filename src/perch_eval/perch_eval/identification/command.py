@@ -1,4 +1,4 @@
-"""Identifies lags, gains, thrust and drag of a vehicle from a flight: a vehicle file, and a page of plots."""
+"""Identify lags, gains, thrust and drag of a vehicle from a flight; write a vehicle file and a page of plots."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ nothing, or a battery that no curve fits"""
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     out = command_parser("identify.py", "Identify lags, gains, thrust and drag of a vehicle from a flight.", EXAMPLES)
     out.add_argument("--vehicle", required=True, help="vehicle file as it is known so far, a name in config/vehicles or a file")
     out.add_argument("--recording", type=Path, nargs="+", default=[], help="MCAP file of a flight (default: fly in the simulator)")
@@ -46,10 +46,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> Sequence[Flight]:
-    """Those that are recorded, or else flown in the simulator: one, or one at each voltage.
+    """Return the recorded flights, or fly in the simulator: one flight, or one at each voltage.
 
     Raises:
-        PerchError: a recording is not there, or voltages are not those of the flights.
+        PerchError: a recording cannot be read, or the voltages do not fit the vehicle or the recordings.
     """
     voltages = arguments.voltage
     if voltages:
@@ -76,7 +76,7 @@ def flights(arguments: argparse.Namespace, vehicle: Vehicle) -> Sequence[Flight]
 
 
 def _identify(arguments: argparse.Namespace) -> int:
-    """Fly or read, fit, write, tell."""
+    """Fly or read the flights, identify, write the files, and print the values."""
     vehicle = load_vehicle(arguments.vehicle)
     flown_as = ", ".join(map(str, arguments.recording)) or f"simulated flight, scenario {arguments.scenario}, seed {arguments.seed}"
     flown = flights(arguments, vehicle)
@@ -101,15 +101,15 @@ def _identify(arguments: argparse.Namespace) -> int:
 
 
 def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flight: str, voltages: Sequence[float] = ()) -> str:
-    """A vehicle file that extends `base` by what was identified; all else stays as it is there, with the reason in a comment.
+    """Return a vehicle file that extends `base` by the identified values; values that were refused get a comment with the reason.
 
     Args:
-        found: what was identified.
-        vehicle: as it was known so far.
-        base: its name, or its file.
-        name: of the identified vehicle.
-        flight: of which it was identified, in words.
-        voltages: of the flights [V], the first one that of the thrust curve.
+        found: identified values.
+        vehicle: vehicle as known so far.
+        base: name or file of that vehicle.
+        name: name of the identified vehicle.
+        flight: description of the flight.
+        voltages: voltages of the flights [V]; the first is that of the thrust curve.
     """
     lines: list[str] = []
     for key in dict.fromkeys(one.key.split("[")[0] for one in found):
@@ -137,7 +137,7 @@ def entries(found: Sequence[Found], vehicle: Vehicle, base: str, name: str, flig
 
 
 def draw(file: Path, found: Sequence[Found], answers: Sequence[Answer], title: str) -> None:
-    """The answers, and below them what was found."""
+    """Write a figure of the responses with the identified values below."""
     figure = answers_figure([replace(answer, t=answer.t - answer.t[0]) for answer in answers])
     figure.suptitle(title)
     figure.supxlabel("\n".join(map(str, found)), family="monospace", fontsize=8, x=0.02, ha="left")

@@ -1,12 +1,12 @@
-"""Models of first order fitted to a record by their output: the commands as they were given, and the scatter between parts of the flight.
+"""First-order models fitted to a record by output error; standard deviations come from the scatter between parts of the flight.
 
     w' = (rate_gain w_cmd(t - delay) - w) / rate_lag      f_z = T - drag_z v_z / mass,  T' = (thrust_gain T_cmd(t - delay) - T) / thrust_lag
     f_z = thrust_coefficient sum Omega^2 / mass - drag_z v_z / mass,  Omega' = (Omega_cmd - Omega) / motor_time_constant
     f_x = -drag_x v_x / mass + bias                         likewise y
 
-The battery's curve comes of several records, one at each voltage.
+The battery's curve is fitted to several records, one at each voltage.
 
-A value that the record does not tell is refused with the reason, and not written.
+A value that is not identifiable from the record is refused with a reason, and not written.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ DELAY_CERTAIN = 0.003  # ... and a delay below this [s]
 
 @dataclass(frozen=True)
 class Found:
-    """A value of the vehicle file.
+    """Identified value of the vehicle file.
 
     Attributes:
-        key: in the file, with the axis in brackets: `actuation.rate_lag[0]`.
-        value, sigma: with its standard deviation, in `unit`.
-        refused: why the record does not tell it; empty: it does.
+        key: key in the file, with the axis in brackets: `actuation.rate_lag[0]`.
+        value, sigma: value and its standard deviation, in `unit`.
+        refused: reason why the value is not identified; empty: it is.
     """
 
     key: str
@@ -56,7 +56,7 @@ class Found:
 
 def _fitted(model: Callable[[np.ndarray], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],
             high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters of `model(parameters)`, and their standard deviations: the scatter of fits to parts / sqrt(their number)."""
+    """Fit the parameters of `model`; return them and their standard deviations: scatter of fits to parts / sqrt(their number)."""
     def fit(samples: slice, x0: Sequence[float] | np.ndarray) -> np.ndarray:
         return least_squares(lambda x: (model(x) - measured)[samples], x0, bounds=(low, high),
                              x_scale=np.maximum(np.abs(start), 1e-2), diff_step=1e-4).x
@@ -79,7 +79,7 @@ def _judged(key: str, value: float, sigma: float, unit: str, why: str, bound: fl
 
 
 def _untold(answer: Answer, least: float) -> str:
-    """Why an answer tells nothing of its loop: commands of less than `least` (1 sigma), or another model; empty: it does."""
+    """Return why a loop is not identifiable: commands below `least` (1 sigma), or a poor fit of the model; empty: it is."""
     size = float(np.std(answer.command))
     if size < least:
         return f"commands of {size:.2g} {answer.unit} (1 sigma) are too small; {least:g} are needed"
@@ -89,13 +89,13 @@ def _untold(answer: Answer, least: float) -> str:
 
 
 def rates(record: Record, axis: int, delay: float | None = None, spread: float = 0.0) -> tuple[list[Found], Answer]:
-    """Lag and gain of one axis of the rate loop with a delay, or with the delay that fits it best, which is then the third.
+    """Identify lag and gain of one axis of the rate loop and, if `delay` is None, its delay, which is the third value.
 
     Args:
-        record: the flight.
-        axis: x, y or z.
-        delay, spread: with its standard deviation [s]. Of commands that are slow against the lag an answer tells the sum of both, so
-            that the delay's uncertainty is the lag's, too.
+        record: record of the flight.
+        axis: index of the axis x, y or z.
+        delay, spread: known delay and its standard deviation [s]. The latter adds to the lag's, as commands that are slow against
+            the lag determine only the sum of lag and delay.
     """
     h, w, free, known = record.period, record.gyro[:, axis], delay is None, delay or 0.0
     assert record.rates is not None
@@ -115,7 +115,7 @@ def rates(record: Record, axis: int, delay: float | None = None, spread: float =
 
 
 def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) -> tuple[list[Found], Answer]:
-    """Lag and gain of the thrust, and the drag along z; of the rotors where their speeds are commanded. For `spread` see `rates`."""
+    """Identify lag and gain of the thrust (or of the rotors, if commanded), and the drag along z. For `spread` see `rates`."""
     h, f, rotors = record.period, record.accel[:, 2], record.rotor_speeds is not None
     sent = record.rotor_speeds if record.rotor_speeds is not None else record.thrust
     assert sent is not None
@@ -140,14 +140,14 @@ def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) 
 
 
 def battery(voltages: Sequence[float], gains: Sequence[Found], flown: float = 0.0) -> Found:
-    """Exponent k of the thrust at a throttle, (voltage / first voltage)^k, by weighted least squares on logarithms.
+    """Identify the exponent k of thrust at equal throttle, (voltage / first voltage)^k, by weighted least squares on logarithms.
 
-    The standard deviation is that of the gains, or their scatter about the curve where that is larger.
+    The standard deviation follows from that of the gains, or from their scatter about the curve if it is larger.
 
     Args:
-        voltages: of the flights [V].
-        gains: of the thrust, one of each flight.
-        flown: exponent by which the throttle already followed the voltage in these flights.
+        voltages: voltages of the flights [V].
+        gains: thrust gain of each flight.
+        flown: exponent by which the throttle was already compensated for the voltage in these flights.
     """
     x = np.log(np.asarray(voltages) / voltages[0])
     y = np.log([gain.value / gains[0].value for gain in gains])[1:]
@@ -169,7 +169,7 @@ def battery(voltages: Sequence[float], gains: Sequence[Found], flown: float = 0.
 
 
 def drag(record: Record, vehicle: Vehicle, axis: int) -> Found:
-    """Linear drag along x or y: the only force there in free air."""
+    """Identify the linear drag along x or y, the only force along these axes in free air."""
     def model(x: np.ndarray) -> np.ndarray:
         return x[1] - x[0] * record.v_B[:, axis]
 
@@ -184,7 +184,7 @@ def _drag(axis: int, value: float, sigma: float, record: Record) -> Found:
 
 
 def identify(record: Record, vehicle: Vehicle) -> tuple[list[Found], list[Answer]]:
-    """Everything that the record can tell of a vehicle, and the answers for the page."""
+    """Identify all values of a vehicle from a record; return them and the responses for the plots."""
     found: list[Found] = []
     answers: list[Answer] = []
     delay, spread = vehicle.actuation.delay, 0.0

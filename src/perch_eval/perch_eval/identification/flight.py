@@ -1,4 +1,4 @@
-"""The flight that tells: a hover, short moves along each axis and turns, at rest in between."""
+"""Flight for identification: a hover, then short moves along each axis and turns, at rest in between."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from perch_sim.scenario import Scenario
 HEIGHT = 1.5                                       # of the hover [m]
 MOVES = (((0.8, 0.0, 0.0), 0.0, 0.9), ((0.0, 0.8, 0.0), 0.0, 0.9), ((0.0, 0.0, 0.6), 0.0, 0.8), ((0.0, 0.0, 0.0), 1.2, 0.8),
          ((1.5, 0.0, 0.4), -0.8, 1.3), ((0.0, -1.2, -0.3), 0.8, 1.1))
-"""Offset [m], turn [rad], duration [s]; each there and back."""
+"""(Offset [m], turn [rad], duration [s]) of each move, which is flown there and back."""
 ROUNDS = 2                                         # all of them
 PAUSE = 0.3                                        # between them [s]
 
 
 def fly(scenario: Scenario, vehicle: str, seed: int, stretch: float = 1.0) -> Flight:
-    """Fly it in the simulator, with estimated state, and without L1: its corrections follow the response that is to be found.
+    """Fly in the simulator with estimated state and without L1, as its corrections depend on the response to be identified.
 
     Args:
-        scenario: the room and how the real vehicle differs from its file.
-        vehicle: name or file; what the controller believes.
-        seed: of everything that is random.
-        stretch: of the moves' durations, where less thrust than usual is left.
+        scenario: the world, and the differences of the true vehicle from its file.
+        vehicle: name or file of the vehicle that the controller assumes.
+        seed: seed of all random draws.
+        stretch: factor of the moves' durations, above 1 if less thrust is available.
 
     Raises:
-        PerchError: the vehicle does not fly with this file.
+        PerchError: the controller leaves its hover: the vehicle does not fly with this file.
     """
     flight = ScriptedFlight(replace(scenario, vehicle=vehicle), seed, without=("powerline_mapper", "perching_planner", "powerline_planner"))
     mission, controller = flight.mission, flight.controller.flight

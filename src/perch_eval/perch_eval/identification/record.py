@@ -1,4 +1,4 @@
-"""The part of a flight in the air as arrays on the IMU's times: commands, gyroscope, accelerometer, velocity."""
+"""Airborne part of a flight as arrays: commands, gyroscope, accelerometer and velocity."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ BEGIN = 1.5      # after that, the ground no longer matters [s]
 
 @dataclass(frozen=True)
 class Record:
-    """A flight without its beginning and its end.
+    """Airborne part of a flight, without take-off and landing.
 
     Attributes:
-        t: of the IMU's samples [s], (n,); `period` apart.
-        gyro, accel: [rad/s], [m/s^2], (n, 3).
-        v_B: velocity in B [m/s], (n, 3).
+        t: stamps of the IMU's samples [s], (n,); `period` apart.
+        gyro, accel: samples of the IMU [rad/s], [m/s^2], (n, 3).
+        v_B: velocity in B at the IMU's samples [m/s], (n, 3).
         command_t: stamps of the commands [s], (m,).
-        rates: commanded [rad/s], (m, 3); None: rotor speeds or attitudes were.
-        thrust: commanded, per mass [m/s^2], (m,); None: rotor speeds were.
-        rotor_speeds: commanded [rad/s], (m, 4); None: rates and thrust were.
+        rates: commanded body rates [rad/s], (m, 3); None: rotor speeds or attitudes are commanded.
+        thrust: commanded thrust per mass [m/s^2], (m,); None: rotor speeds are commanded.
+        rotor_speeds: commanded rotor speeds [rad/s], (m, 4); None: thrust with rates or attitudes is commanded.
     """
 
     t: np.ndarray
@@ -40,14 +40,14 @@ class Record:
 
     @property
     def period(self) -> float:
-        """Of the IMU [s]."""
+        """Period of the IMU [s]."""
         return float(np.median(np.diff(self.t)))
 
     def commanded(self, values: np.ndarray, delay: float) -> np.ndarray:
-        """Commands (m, ...) as they were `delay` before each IMU sample, between their stamps: (n, ...).
+        """Return commands (m, ...), interpolated at `delay` before each IMU sample, (n, ...).
 
-        A command that is held for a period h and read between its ends is h / 2 too early, and an IMU that gives means over its own period
-        is as late: `delay` is the vehicle's + one period.
+        Interpolation of a command that is held for a period h is early by h / 2, and an IMU that averages over its period is late
+        by the same: `delay` is the vehicle's delay plus one period.
         """
         if values.ndim == 1:
             return np.interp(self.t - delay, self.command_t, values)
@@ -55,10 +55,10 @@ class Record:
 
 
 def record_of(flight: Flight) -> Record:
-    """The record of a flight.
+    """Return the record of a flight.
 
     Raises:
-        PerchError: without IMU, odometry or commands, or too short in the air.
+        PerchError: IMU, odometry or commands are missing, or the time in the air is too short.
     """
     commands = {channel: [(t, c) for t, c in flight.values(channel) if c.armed]
                 for channel in ("rates_thrust_command", "attitude_thrust_command", "motor_command")}

@@ -1,7 +1,7 @@
-"""Flights in one process, without ROS: the components that fly, moved by the schedule of every simulated flight.
+"""Flights in one process, without ROS: the components of the nodes, executed by the schedule of every simulated flight.
 
-`fly` flies a scenario; `arrange` gives the same flight for whoever wants to replace a component, to disturb what reaches it, or
-to act between two steps.
+`fly` flies a scenario; `arrange` returns the same flight before its first step, to replace components, to disturb their inputs,
+or to act between two steps.
 """
 
 from perch_eval.in_process.flights import Sensing, arrange, fly

@@ -1,4 +1,4 @@
-"""Which components fly a scenario, and the flight from the goal to its end."""
+"""Selection of the components that fly a scenario, and the flight from the goal to its end."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PLANNERS = {"surface": "perching_planner", "powerline": "powerline_planner"}
 
 @dataclass(frozen=True)
 class Sensing:
-    """Which cameras' images are rendered and looked at; who looks through the others is replaced by an error model."""
+    """Choice per camera: `rendered` images, or `model`, an error model in place of the component that processes them."""
 
     vio: str = choice("model", options=LOOKS)
     target: str = choice("model", options=LOOKS)
@@ -44,19 +44,19 @@ class Sensing:
 
 def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, replace: Mapping[str, Component[Any]] | None = None,
             without: Collection[str] = (), script: Component[Any] | None = None) -> Loop:
-    """The flight of a scenario before its first step.
+    """Return the flight of a scenario before its first step.
 
     Args:
-        scenario: what is flown.
-        seed: of everything that is random; the same seed gives the same flight to the last bit.
+        scenario: scenario to be flown.
+        seed: seed of all random draws; the same seed gives bit-identical flights.
         sensing: which cameras are rendered.
-        replace: name -> component in the place of the scenario's.
-        without: names of components that do not take part.
-        script: leads the flight in the place of the mission: it works at every step before the controller.
+        replace: name -> component in place of the scenario's.
+        without: names of components that are left out.
+        script: component in place of the mission, executed at every step before the controller.
 
     Raises:
-        ConfigError: the scenario or a node's parameter is refused.
-        PerchError: something that has no error model.
+        ConfigError: the scenario or a node's parameter is invalid.
+        PerchError: a cable sags and would need an error model, which does not exist.
     """
     parameters, replace = NodeParameters(scenario, seed), replace or {}
     surface = scenario.mode == "surface"
@@ -90,20 +90,20 @@ def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: flo
     """Fly a scenario once.
 
     Args:
-        scenario: what is flown.
-        seed: of everything that is random; the same seed gives the same flight to the last bit.
+        scenario: scenario to be flown.
+        seed: seed of all random draws; the same seed gives bit-identical flights.
         sensing: which cameras are rendered.
-        linger: flown on after the goal's end [s].
+        linger: simulated time after the goal's end [s].
 
     Raises:
-        ConfigError: the scenario or a node's parameter is refused.
-        PerchError: something that has no error model.
+        ConfigError: the scenario or a node's parameter is invalid.
+        PerchError: a cable sags and would need an error model, which does not exist.
     """
     return perch(arrange(scenario, seed, sensing), scenario, linger)
 
 
 def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
-    """Fly an arrangement from the scenario's goal to its end; arguments as those of `fly`."""
+    """Fly an arranged flight from the scenario's goal to its end; arguments as those of `fly`."""
     began = clock.perf_counter()
     goal = loop.send("mission", goal_of(scenario))
     limit = round(scenario.time_limit * NANOSECONDS)

@@ -1,4 +1,4 @@
-"""The flight loop: the vehicle and its participants in one process, step by step, by the schedule of every simulated flight."""
+"""Flight loop in one process: the vehicle and its participants, step by step, by the schedule of every simulated flight."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from perch_eval.in_process.trace import FlightTrace
 from perch_sim.lockstep import LocalParticipant, Packet, Schedule, Task, local_servers
 
 Filter = Callable[[int, Any], Any]
-"""(stamp of the step [ns], value) -> what arrives instead; None: nothing."""
+"""(stamp of the step [ns], value) -> value that is received instead; None: it is dropped."""
 
 
 class SentGoal:
-    """A goal of the mission as whoever sent it sees it.
+    """Handle of a goal that was sent to the mission.
 
     Attributes:
-        value: what is asked for.
-        cancel_requested: it shall end.
-        result: how it ended; None: it has not.
+        value: the goal.
+        feedback: called with the mission's feedback.
+        cancel_requested: whether the goal is to be cancelled; set by the sender.
+        result: result of the goal; None: it has not ended.
     """
 
     def __init__(self, value: PerchGoal, told: Callable[[Any], None]) -> None:
@@ -31,19 +32,19 @@ class SentGoal:
         self.result: PerchResult | None = None
 
     def finish(self, ending: str, result: PerchResult) -> None:
-        """It has ended."""
+        """Store the result when the goal has ended."""
         self.result = result
 
 
 class _Reached(LocalParticipant):
-    """A participant whose inputs can be disturbed on their way."""
+    """Participant whose inputs can be disturbed."""
 
     def __init__(self, component: Component[Any], filters: Mapping[tuple[str, str], Filter], **options: Any) -> None:
         super().__init__(component, **options)
         self._filters = filters
 
     def begin(self, now: int, batch: Sequence[Packet]) -> None:
-        """Work on what arrives of a batch."""
+        """Process a batch after its values have passed the filters."""
         if self._filters:
             mine = {channel: change for (name, channel), change in self._filters.items() if name == self.name}
             changed = [Packet(p.channel, mine[p.channel](now, p.value)) if p.channel in mine else p for p in batch]
@@ -52,22 +53,22 @@ class _Reached(LocalParticipant):
 
 
 class Loop:
-    """A flight in the making; `step` is one control period.
+    """Flight in progress; `step` advances it by one control period.
 
     Attributes:
-        vehicle: the component that owns time.
-        components: name -> participant's component.
-        trace: what has been emitted.
-        filters: (name of the receiver, channel) -> what becomes of the values on their way; may be changed at any time.
+        vehicle: component that determines the time.
+        components: name -> component of the participant or server.
+        trace: values emitted so far.
+        filters: (name of the receiver, channel) -> filter of the values on that channel; may be changed at any time.
     """
 
     def __init__(self, vehicle: Component[Any], components: Mapping[str, Component[Any]], tasks: Mapping[str, Task],
                  servers: Mapping[str, Component[Any]]) -> None:
         """
         Args:
-            vehicle: owns time; see `perch_sim.lockstep.Schedule`.
+            vehicle: determines the time; see `perch_sim.lockstep.Schedule`.
             components: name -> component.
-            tasks: when each works, in order.
+            tasks: schedule of each component, in the order of execution.
             servers: components that only answer requests: planners.
 
         Raises:
@@ -88,34 +89,34 @@ class Loop:
 
     @property
     def time(self) -> float:
-        """Of the present step [s]."""
+        """Simulation time of the present step [s]."""
         return seconds(self._schedule.now)
 
     def step(self) -> int:
-        """One control period.
+        """Advance by one control period.
 
         Returns:
-            Its stamp [ns].
+            Stamp of the step [ns].
 
         Raises:
-            PerchError: it waits for something, which here can never come.
+            PerchError: the schedule waits for a result; in one process it can never arrive.
         """
         if not self._schedule.advance():
             raise PerchError(f"the flight waits for {', '.join(f'{owed.what} of {owed.name}' for owed in self._schedule.owed())}")
         return self._schedule.now
 
     def request(self, name: str, port: str, request: Any) -> Any:
-        """Ask a service of a component, in front of its next batch.
+        """Call a service of a component; it is executed before the component's next batch.
 
         Returns:
-            A list that gets the answer.
+            A list to which the answer is appended.
         """
         answers: list[Any] = []
         self._participants[name].request(port, request, answers.append)
         return answers
 
     def send(self, name: str, goal: PerchGoal) -> SentGoal:
-        """Send a goal to the mission; its phases go into the trace."""
+        """Send a goal to the mission; its phases are added to the trace."""
         def told(feedback: Any) -> None:
             now = (feedback.phase, feedback.message)
             if not self.trace.phases or self.trace.phases[-1][1:] != now:
@@ -126,6 +127,6 @@ class Loop:
         return sent
 
     def close(self) -> None:
-        """Free what the components hold."""
+        """Release the resources of the components."""
         for component in (self.vehicle, *self.components.values()):
             component.close()

@@ -1,9 +1,9 @@
-"""Error models in the place of images: sightings of the pad with the measured error of the tag pipeline, and a map of the cables.
+"""Error models in place of images: sightings of the pad with the measured error of the tag pipeline, and a map of the cables.
 
 The pad's model replaces the image, not the localiser: the board's corners are projected with the *true* camera (its
-calibration errors included), shaken by the error that `perch_perception.tags` makes on rendered images (0.06 px
-at 1.7 m, 0.18 px at 3 m), and solved with the nominal camera by the code that flies. What it does not model:
-blur, contrast and light.
+calibration errors included), disturbed by the error of `perch_perception.tags` on rendered images (0.06 px at 1.7 m,
+0.18 px at 3 m), and the pose is solved with the nominal camera by the same code as in flight. Blur, contrast and light
+are not modelled.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ MAP_PERIOD = 100_000_000  # [ns]
 
 
 def corner_sigma(side: np.ndarray) -> np.ndarray:
-    """1 sigma of a measured corner along each image axis, for the tag's shortest side [px]."""
+    """Return 1 sigma of a measured corner along each image axis for the tag's shortest side, both [px]."""
     return np.clip(_SIGMA * (_SIDE / np.maximum(side, 1.0)) ** _GROWTH, 0.05, _LARGEST)
 
 
 def modelled_localizer(config: TargetLocalizerConfig, vehicle: SimulatedVehicle, seed: int) -> TargetLocalizer:
-    """The target localiser with its sightings made from the truth."""
+    """Create a target localiser whose sightings are computed from the true state."""
     simulation, truth = vehicle.simulation, StateHistory(MEMORY)
     truth.append(simulation.state)  # an exposure may have its middle before the first step ends
     vehicle.truth.receivers.append(lambda _: truth.append(simulation.state))
@@ -56,19 +56,19 @@ def modelled_localizer(config: TargetLocalizerConfig, vehicle: SimulatedVehicle,
 
 
 class ModelledSight:
-    """Sightings of the board made from the truth, in the place of `BoardLocalizer`."""
+    """Localiser that computes sightings of the board from the true state, in place of `BoardLocalizer`."""
 
     def __init__(self, config: TargetLocalizerConfig, scenario: Scenario, seed: int, truth: StateHistory, pad: Callable[[], PerchSurface]) -> None:
         """
         Args:
-            config: of the localiser.
-            scenario: says which vehicle flies, and how wrong its calibration is.
-            seed: of the calibration's and the corners' errors.
-            truth: the vehicle's last states.
-            pad: gives the true pad as it is now.
+            config: parameters of the localiser.
+            scenario: scenario with the vehicle and its calibration errors.
+            seed: seed of the calibration's and the corners' errors.
+            truth: recent true states of the vehicle.
+            pad: returns the present true pad.
 
         Raises:
-            ConfigError: no such vehicle or board.
+            ConfigError: there is no such vehicle or board.
         """
         self._truth, self._pad, self._config = truth, pad, config
         self._board, self._mount = load_board(config.board), load_vehicle(scenario.vehicle).mounts[config.camera]
@@ -78,7 +78,7 @@ class ModelledSight:
         self._R_CS: np.ndarray | None = None
 
     def process(self, image: Any, exposed: float, body: BodyState | None) -> Localization:
-        """What the localiser would say of an image, which is not looked at; arguments as those of `Localizer.process`."""
+        """Return the modelled localisation of an image, whose content is ignored; arguments as those of `Localizer.process`."""
         tracking = exposed - self._last <= LOST_AFTER
         if not tracking:
             self._R_CS = None
@@ -108,12 +108,12 @@ class ModelledSight:
         return Localization(pose, average, complete)
 
     def middle(self, exposed: float) -> int:
-        """True middle of the exposure [ns] that the calibrated stamp offset puts at `exposed` [s]."""
+        """Return the true middle of an exposure [ns], which by the calibrated stamp offset is at `exposed` [s]."""
         stamp = round((exposed + self._mount.stamp_offset) * NANOSECONDS)
         return stamp - round(self._true.stamp_offset * NANOSECONDS)
 
     def _visible(self, state: TrueState, pad: PerchSurface) -> tuple[np.ndarray, tuple[int, ...], np.ndarray]:
-        """True pixels (n, 4, 2), numbers and shortest sides (n,) of the tags that can be read."""
+        """Return true pixels (n, 4, 2), ids and shortest sides (n,) [px] of the detectable tags."""
         p_WC, R_WC = self._true.pose(state.p_WB, so3.quat_to_matrix(state.q_WB))
         if (p_WC - pad.p_WS) @ pad.normal <= 0.05:
             return np.zeros((0, 4, 2)), (), np.zeros(0)
@@ -128,12 +128,12 @@ class ModelledSight:
 
 @dataclass(frozen=True)
 class NoParameters:
-    """Of a component that has none."""
+    """Parameters of a component without parameters."""
 
 
 @dataclass(frozen=True)
 class MapParameters:
-    """Whose cables are mapped, and when."""
+    """Parameters of the modelled map."""
 
     scenario: str = text("line_80", doc="config/scenarios/<name>.yaml, or a file")
     seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
@@ -141,8 +141,8 @@ class MapParameters:
 
 
 class MappedWorld(Component[MapParameters]):
-    """A map with the mapper's error, ten times a second of the camera's frames, in the place of `powerline_mapper`: every cable at full
-    length from the first frame on, whether or not the camera sees it."""
+    """Map with the error of the mapper, published at 10 Hz, in place of `powerline_mapper`: every cable at full length from the
+    first camera frame on, whether or not it is in view."""
 
     config_type = MapParameters
 
@@ -152,12 +152,12 @@ class MappedWorld(Component[MapParameters]):
     def __init__(self, config: MapParameters, scenario: Scenario | None = None) -> None:
         """
         Args:
-            config: when there is a map.
-            scenario: whose cables are mapped; None: that of `config`.
+            config: parameters.
+            scenario: scenario with the cables; None: that of `config`.
 
         Raises:
-            ConfigError: no such scenario.
-            PerchError: a cable sags: there is no error model for a map of curves.
+            ConfigError: there is no such scenario.
+            PerchError: a cable sags; the error model is limited to straight lines.
         """
         super().__init__(config)
         scenario, rng = scenario or load_scenario(config.scenario), seeding.stream(config.seed, "line_map")
@@ -167,14 +167,14 @@ class MappedWorld(Component[MapParameters]):
         self._next = 0
 
     def on_frame(self, frame: CameraModel) -> None:
-        """The map of a frame."""
+        """Publish the map if it is due at this frame."""
         if frame.stamp >= self._next:
             self._next = frame.stamp + MAP_PERIOD
             self.powerlines(PowerlineMap(frame.stamp, self._lines, False, ""))
 
 
 def _mapped(number: int, cable: Cable, rng: np.random.Generator) -> MappedPowerline:
-    """A cable as a mapper finds it: each end is off by `MAP_ERROR`."""
+    """Return a cable as mapped: each axis of both ends has an error of `MAP_ERROR` (1 sigma)."""
     true = Segment.between(np.array(cable.start), np.array(cable.end), cable.radius, number)
     first, last = (end + MAP_ERROR * rng.normal(size=3) for end in true.ends)
     line = Segment.between(first, last, cable.radius, number)

@@ -1,4 +1,4 @@
-"""The components of a scenario with their parameters, from the same sources as the real nodes'."""
+"""Components of a scenario with their parameters, from the same sources as those of the real nodes."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ COMPONENTS = {
     "recorder": "perch_eval.ros.recorder:Recorder",
     "viewer": "perch_eval.ros.viewer:Viewer",
 }
-"""Node -> its component."""
+"""Node -> class of its component, as `module:class`."""
 
 
 def component_class(node: str, parameters: Mapping[str, Any]) -> type[Component[Any]]:
-    """The component of a node, which its parameters may choose.
+    """Return the class of a node's component; that of `estimator` is selected by its parameter `type`.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no such estimator.
     """
     if node == "estimator" and "type" in parameters:
         return estimator_class(parameters["type"])
@@ -45,48 +45,48 @@ def component_class(node: str, parameters: Mapping[str, Any]) -> type[Component[
 
 
 class NodeParameters:
-    """What `config/<node>.yaml`, the scenario and its `parameters` say for each node.
+    """Parameters of each node from `config/<node>.yaml`, the scenario and its `parameters`.
 
     Attributes:
-        given: node -> its parameters by dotted name.
+        given: node -> parameters by dotted name.
     """
 
     def __init__(self, scenario: Scenario, seed: int, nodes: Collection[str] = tuple(COMPONENTS)) -> None:
         """
         Args:
-            scenario: what is flown.
-            seed: of the flight.
-            nodes: those that are asked for.
+            scenario: scenario to be flown.
+            seed: seed of the flight.
+            nodes: names of the nodes.
 
         Raises:
-            ConfigError: a parameter file is none.
+            ConfigError: a parameter file is invalid.
         """
         # The scenario may name parameters of either VIO; both are read, one is flown.
         self.given = {launch.name: launch.parameters for launch in node_launches(scenario, tuple(nodes), seed=seed)}
 
     def of(self, node: str, cls: type[T]) -> T:
-        """The parameters of a node.
+        """Return the parameters of a node.
 
         Raises:
-            ConfigError: one of them is unknown, of the wrong type, or out of range.
+            ConfigError: a parameter is unknown, of the wrong type, or out of range.
         """
         return config.from_mapping(cls, config.nested(self.given[node]), node)  # type: ignore[type-var]
 
     def component(self, node: str) -> Component[Any]:
-        """The component of a node with its parameters.
+        """Create the component of a node with its parameters.
 
         Raises:
-            ConfigError: a parameter is refused.
+            ConfigError: a parameter is invalid.
         """
         cls = component_class(node, self.given[node])
         return cls(self.of(node, cls.config_type))
 
 
 def check_parameters(scenario: Scenario, source: str) -> None:
-    """Make sure that every node takes what the scenario sets for it.
+    """Check the parameters that a scenario sets for nodes.
 
     Raises:
-        ConfigError: with the parameter's place in the scenario.
+        ConfigError: a parameter is invalid; contains its place in the scenario.
     """
     parameters = NodeParameters(scenario, 1, scenario.parameters or ())
     for node in scenario.parameters or ():

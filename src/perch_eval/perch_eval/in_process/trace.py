@@ -1,4 +1,4 @@
-"""What a flight leaves behind: the values of every channel but the cameras', and how it ended."""
+"""Trace of a flight: the values of every channel except the cameras', and the outcome."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from perch_eval.flight import Flight, timed
 
 
 def stamp_of(value: Any) -> int:
-    """A value's own stamp, as its message's header has it [ns]; of an order that of its start."""
+    """Return the stamp of a value as in its message's header [ns]; of a trajectory order, its start time."""
     return nanoseconds(value.trajectory.start_time) if isinstance(value, TrajectoryOrder) else value.stamp
 
 
 class FlightTrace:
-    """One flight.
+    """Trace of one flight.
 
     Attributes:
         outcome: `perched`, or the lower-case name of the mission's result; `timeout` past the time limit.
-        message: the mission's words.
-        end_time: when the goal ended [s].
-        wall_time: what it took [s].
-        phases: (time [s], phase, message) of the mission whenever they change.
+        message: message of the mission's result.
+        end_time: simulation time of the goal's end [s].
+        wall_time: wall-clock time of the flight [s].
+        phases: (time [s], phase, message) of the mission at every change.
     """
 
     def __init__(self) -> None:
@@ -32,27 +32,27 @@ class FlightTrace:
         self._values: dict[str, list[Any]] = {}
 
     def tap(self, component: Component[Any]) -> None:
-        """Keep what a component emits from now on, but for frames of cameras, log lines and what has an absolute name."""
+        """Record the outputs of a component, except camera channels, debug images, log lines and channels with absolute names."""
         for port in ports(type(component), Output):
             channel = port.channel(component)
             if port is not Component.log and not channel.startswith(("/", "camera_")) and channel != "vio/debug_image":
                 getattr(component, port.name).receivers.append(self._values.setdefault(channel, []).append)
 
     def values(self, channel: str) -> list[Any]:
-        """The values of a channel in the order of emission; empty where there are none."""
+        """Return the values of a channel in the order of emission; empty: there are none."""
         return list(self._values.get(channel, ()))
 
     def timeline(self) -> list[tuple[str, int, Any]]:
-        """(channel, stamp [ns], value) of everything, by stamp."""
+        """Return (channel, stamp [ns], value) of all values, sorted by stamp."""
         entries = [(channel, stamp_of(value), value) for channel, values in sorted(self._values.items()) for value in values]
         return sorted(entries, key=lambda entry: entry[1])
 
     @property
     def flight(self) -> Flight:
-        """As the figures are computed of, and as a recording is read."""
+        """The trace as a flight, the form in which recordings are read and metrics computed."""
         return Flight({channel: timed(values) for channel, values in self._values.items() if values})
 
     @property
     def contacts(self) -> list[Contact]:
-        """What the vehicle truly touched."""
+        """True contacts of the vehicle."""
         return self.values("contact")

@@ -1,1 +1,1 @@
-"""Inspection of powerlines [P:VI-A]: layouts, flights and their measures."""
+"""Inspection of powerlines [P:VI-A]: layouts, flights and measures."""

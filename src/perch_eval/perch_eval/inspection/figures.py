@@ -1,4 +1,4 @@
-"""Pictures of an inspection: the paths in space and the measures over time. [P:Fig.4, P:Fig.5]"""
+"""Figures of an inspection: paths in space and measures over time. [P:Fig.4, P:Fig.5]"""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SIGHT_LENGTH = 0.35  # of the drawn camera axis [m]
 
 
 def paths_figure(flight: Inspected) -> Figure:
-    """Reference and flight in space, as the paper's Fig. 4: where the reference collides it is red, the camera's axis green."""
+    """Plot reference and flight in space, as the paper's Fig. 4: collisions of the reference in red, camera axis in green."""
     figure = Figure(figsize=(9, 6.5), layout="constrained")
     axes = figure.add_subplot(projection="3d")
     p, r = flight.states[:, 0:3], flight.reference_states[:, 0:3]
@@ -37,7 +37,7 @@ def paths_figure(flight: Inspected) -> Figure:
 
 
 def metrics_figure(flight: Inspected) -> Figure:
-    """Clearance, reprojection error, cheirality and segment visibility over time, as the paper's Fig. 5."""
+    """Plot clearance, reprojection error, cheirality and segment visibility over time, as the paper's Fig. 5."""
     figure = Figure(figsize=(8, 7.5), layout="constrained")
     panels = figure.subplots(4, 1, sharex=True)
     ways = ((flight.reference_times, flight.reference, REFERENCE, "--", "reference"), (flight.times, flight.flown, FLOWN, "-", "flown"))

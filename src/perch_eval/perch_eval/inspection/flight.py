@@ -1,6 +1,6 @@
-"""One inspection in process, led by a script: VIO and the map of the cables by their error models. [P:VI-A]
+"""Scripted inspection in process, with error models of VIO and of the map of the cables. [P:VI-A]
 
-The controller knows the state that the estimator has and a map with an error; truth enters through the sensors' models alone.
+The controller receives the estimated state and a map with errors; the true state is used by the sensors' models only.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ SETTLE = 1.0  # hover before the line terms begin, and when they have grown [s]
 
 
 def fly(scenario: Scenario, seed: int, with_lines: bool = True) -> Inspected:
-    """Take off below the first waypoint, let the line terms grow, fly the waypoint lines.
+    """Take off to the first waypoint, wait until the line terms have full weight, and fly the waypoint lines.
 
     Args:
-        scenario: mode `inspection`.
-        seed: of everything that is random.
-        with_lines: False: the controller is not told of the lines, and follows the reference as it is.
+        scenario: scenario of mode `inspection`.
+        seed: seed of all random draws.
+        with_lines: whether the controller receives the lines; without them it follows the reference only.
 
     Raises:
         PerchError: the scenario is not an inspection, or the vehicle does not take off.

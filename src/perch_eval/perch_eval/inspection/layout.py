@@ -1,4 +1,4 @@
-"""Random places to inspect: three cables, and waypoints whose straight lines collide twice and look past the cable. [P:VI-A]"""
+"""Random layouts for inspection: three cables, and waypoints whose lines collide twice and keep the cable off-centre. [P:VI-A]"""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ DRAWS = 1000
 
 
 def random_layout(base: Scenario, seed: int) -> Scenario:
-    """`base` with cables and waypoints drawn anew; the reference collides exactly twice.
+    """Return `base` with random cables and waypoints, such that the reference collides exactly twice.
 
-    The watched cable hangs about 4 m in front, up to 12 deg askew and 6 deg inclined; the waypoints run along it at a distance of
-    1.4 to 2.4 m, each so high or low that the cable is 80 to 230 px from the image centre, and up to 25 deg turned away.
-    One or two slanted cables cross the way of the reference; where it is one, the reference touches the watched cable itself.
+    The watched cable hangs about 4 m in front, with an azimuth of up to 12 deg and an inclination of up to 6 deg. The waypoints
+    run along it at 1.4 to 2.4 m; their heights put the cable 80 to 230 px from the image centre, their yaw is up to 25 deg off.
+    One or two slanted cables cross the reference; if only one does, the reference also touches the watched cable.
 
     Args:
-        base: everything that is not drawn.
-        seed: of the layout.
+        base: scenario with everything that is not drawn.
+        seed: seed of the layout.
 
     Raises:
-        RuntimeError: no such layout was drawn.
+        RuntimeError: no such layout was found.
     """
     rng = np.random.default_rng(seed)
     vehicle = load_vehicle(base.vehicle)
@@ -83,7 +83,7 @@ def _draw(base: Scenario, rng: np.random.Generator) -> Scenario:
 
 
 def _way_up(scenario: Scenario, cables: list[Segment], radii: Vector3) -> bool:
-    """The take-off, straight up to the first waypoint, is free."""
+    """Return whether the take-off, straight up to the first waypoint, is clear of the cables."""
     x, y, z = scenario.inspection.waypoints[0].position
     column = np.column_stack([np.full(30, x), np.full(30, y), np.linspace(0.0, z, 30)])
     level = np.tile([0.0, 0.0, 0.0, 1.0], (30, 1))

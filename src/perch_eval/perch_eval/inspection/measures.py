@@ -1,4 +1,4 @@
-"""What an inspection is judged by: collisions, and the measures of the paper's Fig. 5. [P:eq7, P:eq9, P:eq12, P:eq13]"""
+"""Measures of an inspection: collisions, and the quantities of the paper's Fig. 5. [P:eq7, P:eq9, P:eq12, P:eq13]"""
 
 from __future__ import annotations
 
@@ -25,46 +25,46 @@ EVERY = 5      # true states are judged at 100 Hz
 
 
 def segments(scenario: Scenario) -> list[Segment]:
-    """The cables of a scenario, which are straight here, in W."""
+    """Return the cables of a scenario as straight segments in W."""
     return [Segment.between(np.array(c.start), np.array(c.end), c.radius, k) for k, c in enumerate(scenario.world.cables)]
 
 
 def watched(scenario: Scenario, lines: list[Segment]) -> Segment:
-    """The line that the scenario's rough point means."""
+    """Return the line nearest to the scenario's approximate point, which is the line to watch."""
     return min(lines, key=lambda s: float(s.distance(np.array(scenario.inspection.watched))))
 
 
 def reference_of(scenario: Scenario, start_time: float = 0.0) -> FlatTrajectory:
-    """The waypoint lines of a scenario."""
+    """Return the reference trajectory: straight lines between the waypoints of a scenario."""
     places = [(np.array(w.position), float(np.radians(w.yaw_deg))) for w in scenario.inspection.waypoints]
     return waypoint_lines(places, scenario.inspection.speed, start_time)
 
 
 def reference_states(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Times from its start [s], shape (n,), and states of the reference by flatness: p, q, v, w, shape (n, 13). [M:eq9-13]"""
+    """Return times since the reference's start [s], (n,), and its states by flatness, p, q, v, w, (n, 13). [M:eq9-13]"""
     vehicle, source = packed_vehicle(load_vehicle(scenario.vehicle)), FlatReference(reference_of(scenario))
     times = np.arange(0.0, source.duration, SAMPLE)
     return times, np.array([reference_row(source.setpoint(float(t)).packed, 0.5, vehicle)[:13] for t in times])
 
 
 def clearance(states: np.ndarray, lines: Sequence[Segment], radii: Vector3) -> np.ndarray:
-    """Scaled distance of the nearest line minus 1 at each state, negative: the line is in the body, shape (n,)."""
+    """Return the scaled distance of the nearest line minus 1 at each state, shape (n,); negative: the line is in the body."""
     return np.min([scaled_clearance(states[:, 0:3], states[:, 3:7], line, radii) for line in lines], axis=0)
 
 
 def collisions(clear: np.ndarray) -> int:
-    """How often a line enters the body, from clearances, shape (n,)."""
+    """Return how often a line enters the body, from clearances of shape (n,)."""
     inside = np.concatenate([[False], clear < 0.0])
     return int(np.count_nonzero(~inside[:-1] & inside[1:]))
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """A way past the lines, judged.
+    """Measures of a path past the lines.
 
     Attributes:
         clearance: scaled clearance of the nearest line, shape (n,). [P:eq7]
-        seen: measures of the watched line, n states.
+        seen: visibility of the watched line at n states.
         corner: distance of the image's corners from its centre [px].
     """
 
@@ -74,18 +74,18 @@ class Judgement:
 
     @property
     def collisions(self) -> int:
-        """How often a line enters the body."""
+        """Number of times that a line enters the body."""
         return collisions(self.clearance)
 
     @property
     def reprojection(self) -> float:
-        """Mean distance of the watched line from the image centre [px]; a line beyond the image's corners, or behind the camera, counts
-        as at them, so that a way into the line does not count for more than one past it. [P:eq9]"""
+        """Mean distance of the watched line from the image centre [px], limited to that of the image's corners, which also counts
+        for a line behind the camera: a path into the line does not weigh more than one past it. [P:eq9]"""
         return float(np.mean(np.where(self.seen.cheirality, np.minimum(self.seen.reprojection, self.corner), self.corner)))
 
 
 def judge(states: np.ndarray, lines: Sequence[Segment], line: Segment, vehicle: Vehicle) -> Judgement:
-    """Judge states p, q, ..., shape (n, >= 7), against the true lines, of which `line` is to be watched."""
+    """Compute the measures of states p, q, ..., shape (n, >= 7), with the true lines; `line` is the watched one."""
     mount = vehicle.mounts["front"]
     return Judgement(clearance(states, lines, vehicle.body_radii), visibility(states, line, mount),
                      float(np.hypot(mount.camera.width, mount.camera.height)) / 2)
@@ -93,16 +93,16 @@ def judge(states: np.ndarray, lines: Sequence[Segment], line: Segment, vehicle: 
 
 @dataclass(frozen=True)
 class Inspected:
-    """A flown inspection beside its reference.
+    """Flown inspection and its reference.
 
     Attributes:
-        times: since the start of the reference [s], shape (n,).
+        times: times since the start of the reference [s], shape (n,).
         states: true p, q, ..., shape (n, >= 7).
-        flown: the flight, judged by the true lines.
-        reference_times, reference_states, reference: the same of the waypoint lines, as if flown exactly.
+        flown: measures of the flight, with the true lines.
+        reference_times, reference_states, reference: the same of the reference, the waypoint lines flown exactly.
         lines, line: the true lines, and the watched one.
-        crashes: how often the plant reports a collision.
-        message: why the flight ended early; empty: it came to its end.
+        crashes: number of collisions that the plant reports.
+        message: why the flight ended early; empty: it was completed.
     """
 
     times: np.ndarray
@@ -118,12 +118,12 @@ class Inspected:
 
     @property
     def collisions(self) -> int:
-        """Of the flight, by the plant or by the geometry of the states, whichever counts more."""
+        """Number of collisions of the flight: the larger of those by the plant and by the geometry of the states."""
         return max(self.flown.collisions, self.crashes)
 
 
 def inspected(scenario: Scenario, times: np.ndarray, states: np.ndarray, crashes: int = 0, message: str = "") -> Inspected:
-    """A flight of a scenario, judged; arguments as the fields of `Inspected`."""
+    """Compute the measures of a scenario's flight; arguments as the fields of `Inspected`."""
     vehicle, lines = load_vehicle(scenario.vehicle), segments(scenario)
     line = watched(scenario, lines)
     reference_times, reference = reference_states(scenario)
@@ -132,12 +132,12 @@ def inspected(scenario: Scenario, times: np.ndarray, states: np.ndarray, crashes
 
 
 def recorded(flight: Flight, scenario: Scenario, message: str = "") -> Inspected | None:
-    """The last trajectory of a flight as an inspection; None where none was flown, or a cable sags (the measures are those of lines).
+    """Return the last trajectory of a flight as an inspection; None if there is none, or a cable sags (measures need lines).
 
     Args:
-        flight: what was flown.
-        scenario: where the lines truly are.
-        message: why it ended early, where that was no collision.
+        flight: the flight.
+        scenario: scenario with the true lines.
+        message: why the flight ended early, if not by a collision.
     """
     if scenario.mode != "inspection" or any(cable.sag > 0.0 for cable in scenario.world.cables):
         return None

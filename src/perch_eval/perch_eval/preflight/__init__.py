@@ -1,1 +1,1 @@
-"""Is a vehicle ready to fly: what its graph brings is judged against the vehicle file, with the props off."""
+"""Preflight check of a vehicle with the props off: the data of its graph are compared with the vehicle file."""

@@ -1,4 +1,4 @@
-"""Judgements of what a graph has brought in a few seconds. Each has a verdict, what was seen, and what to do."""
+"""Checks of the data that a graph published in a few seconds. Each has a verdict, the observation, and advice."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ STOPPED = 1.0     # from the last command to the motors' stop [s] ...
 DESCENDED = 5.0   # ... and where an autopilot levels and descends first [s]
 RATES = {"imu/data_raw": (100.0, 1000.0), "odometry": (50.0, 1000.0), "camera_down/camera_info": (10.0, 120.0),
          "camera_front/camera_info": (5.0, 120.0)}
-"""Channel -> lowest and highest rate of its stamps [Hz]; a tenth is forgiven."""
+"""Channel -> (lowest, highest) rate of its stamps [Hz], with a tolerance of 10 %."""
 _STATES = {state.value: state.name.lower() for state in State}
 
 
 class Verdict(Enum):
-    """Of a check."""
+    """Verdict of a check."""
 
     PASSED = "passed"
     FAILED = "FAILED"
@@ -47,7 +47,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the table: what was looked at, the verdict, what was seen, and what to do where it has not passed."""
+    """One line of the table: name of the check, verdict, observation, and advice if the check has not passed."""
 
     name: str
     verdict: Verdict
@@ -60,12 +60,12 @@ class Check:
 
 
 def judged(name: str, good: bool, seen: str, advice: str) -> Check:
-    """A check that passes or fails."""
+    """Return a check that has passed or failed."""
     return Check(name, Verdict.PASSED if good else Verdict.FAILED, seen, advice)
 
 
 def stream(channel: str, stamps: Sequence[int]) -> list[Check]:
-    """Rate of a channel, and whether its stamps [ns] go on evenly."""
+    """Check the rate of a channel, and whether its stamps [ns] grow evenly."""
     low, high = RATES[channel]
     if len(stamps) < 3:
         return [Check(f"rate {channel}", Verdict.FAILED, f"{len(stamps)} messages",
@@ -81,7 +81,7 @@ def stream(channel: str, stamps: Sequence[int]) -> list[Check]:
 
 
 def rest(samples: Sequence[ImuSample]) -> list[Check]:
-    """Gravity and rates of a vehicle that stands still on its feet."""
+    """Check specific force and body rates of a vehicle that stands still on its feet."""
     if len(samples) < 50:
         return [Check("gravity up", Verdict.FAILED, "no IMU", "see rate imu/data_raw")]
     f, w = (np.mean([getattr(s, name) for s in samples], axis=0) for name in ("f_B", "w_B"))
@@ -98,9 +98,9 @@ def rest(samples: Sequence[ImuSample]) -> list[Check]:
 
 
 def clocks(imu: Sequence[tuple[float, int]], frames: Mapping[str, Sequence[tuple[float, int]]]) -> list[Check]:
-    """Whether cameras and IMU share a clock: arrival [s] and stamp [ns] of each IMU sample, and of the frames of each camera.
+    """Check whether cameras and IMU share a clock, from (arrival [s], stamp [ns]) of IMU samples and of each camera's frames.
 
-    The shortest way from stamp to arrival counts: a program that is late itself says nothing of the others.
+    The shortest latency from stamp to arrival counts, as delays of this program only increase it.
     """
     def shortest(arrivals: Sequence[tuple[float, int]]) -> float:
         return min(arrival - seconds(stamp) for arrival, stamp in arrivals)
@@ -116,7 +116,7 @@ def clocks(imu: Sequence[tuple[float, int]], frames: Mapping[str, Sequence[tuple
 
 
 def camera_model(name: str, model: CameraModel | None, vehicle: Vehicle) -> Check:
-    """A camera's intrinsics against the vehicle file."""
+    """Check a camera's intrinsics and frame against the vehicle file."""
     mount, title = vehicle.mounts[name], f"camera_{name} model"
     if model is None:
         return Check(title, Verdict.FAILED, "no camera_info", f"see rate camera_{name}/camera_info")
@@ -138,7 +138,7 @@ def _camera(camera: Camera) -> str:
 
 
 def extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]:
-    """Fixed transforms of the graph against the vehicle file."""
+    """Check the fixed transforms of the graph against the vehicle file."""
     found = []
     for want in fixed_frames(vehicle):
         have = next((t for t in transforms if t.child == want.child), None)
@@ -155,7 +155,7 @@ def extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]
 
 
 def frames(odometry: OdometryState | None, imu: ImuSample | None, placed: bool) -> list[Check]:
-    """Names of frames; `placed`: the nodes know the axes of the IMU."""
+    """Check the names of frames; `placed`: whether the axes of the IMU are known."""
     return [judged(f"frame {name}", value is not None and good, "nothing" if value is None else repr(value.frame), advice)
             for name, value, good, advice in (
                 ("odometry", odometry, odometry is not None and odometry.frame == "map", "must be 'map'"),
@@ -163,25 +163,25 @@ def frames(odometry: OdometryState | None, imu: ImuSample | None, placed: bool) 
 
 
 def camera_rotation(turned_B: np.ndarray, turned_C: np.ndarray) -> tuple[np.ndarray, float]:
-    """Orthogonal matrix that best turns the camera's rates into the gyroscope's (Procrustes' problem).
+    """Return the orthogonal matrix that best maps the camera's rates to the gyroscope's (orthogonal Procrustes problem).
 
-    A rotation where both are right-handed; of determinant -1 where one axis has the wrong sign.
+    It is a rotation if both are right-handed; its determinant is -1 if one axis, or all three, have the wrong sign.
 
     Args:
         turned_B: mean rates of the gyroscope between frames in B [rad/s], (n, 3).
-        turned_C: of the camera in C [rad/s], (n, 3).
+        turned_C: mean rates of the camera between frames in C [rad/s], (n, 3).
 
     Returns:
-        R_BC, (3, 3), and the root mean square of the rates about the axis that was turned about least [rad/s].
+        R_BC, (3, 3), and the root mean square of the rates about the axis with the least rotation [rad/s].
     """
     U, _, Vt = np.linalg.svd(turned_B.T @ turned_C)
     return U @ Vt, float(np.linalg.svd(turned_B, compute_uv=False)[2] / np.sqrt(max(len(turned_B), 1)))
 
 
 def shaken(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehicle) -> Check:
-    """The rotation between a camera and the IMU, and the gyroscope's scale, from shaking the vehicle by hand.
+    """Check the rotation between a camera and the IMU, and the gyroscope's scale, while the vehicle is shaken by hand.
 
-    Arguments are those of `camera_rotation`.
+    `turned_B` and `turned_C` are those of `camera_rotation`.
     """
     title, advice = f"rotation camera_{name} to IMU", (
         "turn the vehicle to and fro about all axes, by 20 deg, over something with texture (--shake)")
@@ -209,12 +209,12 @@ def shaken(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehic
 
 @dataclass(frozen=True)
 class Order:
-    """What an order to the controller led to.
+    """Effect of a command to the controller.
 
     Attributes:
-        status: the first one that shows its effect, or the last that came.
-        delay: until its effect [s].
-        armed: whether the commands to the vehicle after it were; None: there were none.
+        status: newest status after the wait for the effect; None: none was received.
+        delay: time to the effect, or of the time-out [s].
+        armed: whether the latest command to the vehicle after it is armed; None: there was none.
     """
 
     status: ControllerStatus | None
@@ -223,7 +223,7 @@ class Order:
 
 
 def obeyed(name: str, order: Order, state: int, armed: bool) -> Check:
-    """Whether an order has had its effect: the controller's state, and that of the commands to the vehicle."""
+    """Check the effect of a command: the controller's state, and whether the commands to the vehicle are armed."""
     status = order.status
     good = status is not None and status.state == state and order.delay <= ANSWER and order.armed is armed
     sent = "none" if order.armed is None else "armed" if order.armed else "disarmed"
@@ -233,7 +233,7 @@ def obeyed(name: str, order: Order, state: int, armed: bool) -> Check:
 
 
 def stopped(last_command: float | None, last_motion: float | None, bound: float = STOPPED) -> Check:
-    """Whether the motors stop when commands do: when the last command came, and when a rotor last turned [s]."""
+    """Check that the motors stop when commands end, from the times of the last command and of the last turning of a rotor [s]."""
     title, advice = "watchdog", "with the props off: --watchdog, and stop the controller's process when asked"
     if last_command is None:
         return Check(title, Verdict.OPEN, "commands did not end", advice)
@@ -246,11 +246,11 @@ def stopped(last_command: float | None, last_motion: float | None, bound: float 
 
 
 def taken_over(turned: bool, armed: bool | None) -> Check:
-    """Whether the pilot's switch stops the motors though commands go on.
+    """Check that the pilot's switch stops the motors while commands continue.
 
     Args:
         turned: whether the motors turned before.
-        armed: whether the commands to the vehicle went on, armed, when the motors stopped; None: they did not stop.
+        armed: whether armed commands to the vehicle continued when the motors stopped; None: the motors did not stop.
     """
     title = "pilot's takeover"
     if not turned or armed is False:

@@ -1,4 +1,4 @@
-"""The program `preflight`."""
+"""Command line program `preflight`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PATIENCE = 60.0  # with the hands that are asked for something [s]
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     out = command_parser("preflight.py", "Check a running vehicle before it flies.", EXAMPLES)
     out.add_argument("--vehicle", required=True, help="vehicle file, or its name in config/vehicles")
     out.add_argument("--sensors", default="", help="sensor file that its nodes are given: axes of the IMU")
@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def in_body(listener: Any, sensors: str) -> list[ImuSample]:
-    """The IMU samples that were heard, in the axes of B, as the nodes turn them; none where their axes are not known."""
+    """Return the received IMU samples in the axes of B, rotated as in the nodes; without samples of unknown axes."""
     axes = ImuAxes(lambda *_: None, sensors)
     for _, transform in listener.values["/tf_static"]:
         axes.add_transform(transform)
@@ -52,7 +52,7 @@ def in_body(listener: Any, sensors: str) -> list[ImuSample]:
 
 
 def listened(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]:
-    """What is judged of a vehicle at rest."""
+    """Return the checks of a vehicle at rest."""
     values = {channel: [value for _, value in entries] for channel, entries in listener.values.items()}
     channels = [c for c in checks.RATES if not c.startswith("camera_") or c.split("/")[0].removeprefix("camera_") in vehicle.mounts]
     found = [check for channel in channels for check in checks.stream(channel, [value.stamp for value in values[channel]])]
@@ -66,7 +66,7 @@ def listened(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]:
 
 
 def shaken(listener: Any, vehicle: Vehicle, camera: str | None, sensors: str) -> Check:
-    """The rotation between camera and IMU, told while the vehicle is shaken; without a camera it is not."""
+    """Ask for the vehicle to be shaken and check the rotation between camera and IMU; without a camera it is not exercised."""
     turned = np.zeros((0, 3)), np.zeros((0, 3))
     if camera:
         listener.watch(camera, vehicle.mounts[camera].camera)
@@ -79,7 +79,7 @@ def shaken(listener: Any, vehicle: Vehicle, camera: str | None, sensors: str) ->
 
 
 def exercised(listener: Any, arguments: argparse.Namespace, bound: float = checks.STOPPED) -> list[Check]:
-    """Arming, disarming, killing, the pilot's takeover and the watchdog, where the propellers are off; `bound`: see `checks.stopped`."""
+    """Check arming, disarming, kill, the pilot's takeover and watchdog, with the props off; `bound`: see `checks.stopped`."""
     if not arguments.props_off:
         return [Check(name, Verdict.OPEN, "the motors were not started", "take the propellers off, and add --props-off")
                 for name in ("armed state", "disarming", "kill", "pilot's takeover", "watchdog")]
@@ -103,7 +103,7 @@ def exercised(listener: Any, arguments: argparse.Namespace, bound: float = check
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    """Listen, judge, tell."""
+    """Receive data, check them, and print the verdicts."""
     if not 1.0 <= arguments.listen <= 300.0:
         raise PerchError(f"--listen: {arguments.listen:g} is outside [1, 300] s")
     vehicle = load_vehicle(arguments.vehicle)

@@ -19,7 +19,7 @@ TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0", "gt0")
 
 
 def root_of(path: Path) -> Path | None:
-    """The folder with `cam*` of a recording in this format; None: it is none."""
+    """Return the folder that holds `cam*` of a recording in this format; None if the path is not such a recording."""
     for folder in (path / "mav0", path):
         if any(folder.glob("cam*/data.csv")):
             return folder
@@ -31,7 +31,7 @@ class AslRecording(Recording):
     def __init__(self, path: Path, sensors: Sensors | None) -> None:
         """
         Raises:
-            RecordingError: a file is missing or is none of its format.
+            RecordingError: a file is missing or malformed.
             ConfigError: a `sensor.yaml` cannot be used.
         """
         root = root_of(path)
@@ -60,12 +60,12 @@ class AslRecording(Recording):
 
     @property
     def truth(self) -> Path | None:
-        """The motion capture's file."""
+        """File of the ground truth; None if there is none."""
         files = (self._root / name / "data.csv" for name in TRUTHS)
         return next((file for file in files if file.is_file() and file.stat().st_size > 1000), None)
 
     def events(self) -> Iterator[Event]:
-        """In the order of the stamps, until a little after the last image; an IMU sample comes before an image of the same stamp."""
+        """Yield events in the order of their stamps, to `AFTER` the last image; at equal stamps, IMU samples come first."""
         cameras, last = self.sensors.cameras if self.sensors is not None else {}, self._frames[-1][0] + AFTER
         samples = takewhile(lambda event: event.arrived <= last, map(self._sample, range(len(self._stamps))))
         frames = (Event(name, stamp, picture(path, stamp, name, cameras.get(name))) for stamp, name, path in self._frames)
@@ -90,7 +90,7 @@ def _frames(path: Path) -> list[tuple[int, str]]:
 
 
 def rows_of(path: Path) -> list[str]:
-    """Lines of a file but empty ones and those that begin with #.
+    """Return the lines of a file, without empty ones and comments (#).
 
     Raises:
         RecordingError: it cannot be read.
@@ -102,11 +102,11 @@ def rows_of(path: Path) -> list[str]:
 
 
 def table(path: Path, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """A table of numbers, separated by commas, whose first column is a stamp.
+    """Read a comma-separated table of numbers whose first column is a stamp.
 
     Args:
         path: of the file.
-        columns: how many are read, with the stamp.
+        columns: number of columns to read, with the stamp.
 
     Returns:
         Stamps [ns], int64, shape (n,), exact; and the other columns, shape (n, columns - 1).

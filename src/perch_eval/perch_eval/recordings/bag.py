@@ -29,9 +29,9 @@ def is_bag(path: Path) -> bool:
 
 
 class BagRecording(Recording):
-    """A bag. A camera is the topic that the sensor file names, or `camera_<name>/image_raw` (or `/compressed` below it).
+    """A bag. A camera's topic is the one in the sensor file, or else `camera_<name>/image_raw` (or `/compressed` below it).
 
-    An `.mcap` that broke off is read as far as it goes, from a copy that has an index.
+    A truncated `.mcap` is read as far as possible, from a copy that has an index.
     """
     def __init__(self, path: Path, sensors: Sensors | None) -> None:
         """
@@ -68,7 +68,7 @@ class BagRecording(Recording):
         self.samples = counts[self._imu] if self._imu else 0
 
     def events(self) -> Iterator[Event]:
-        """In the order in which they were recorded. Images that cannot be used are left out and said in `damage`."""
+        """Yield events in the order of their recording. Images that cannot be used are left out and reported in `damage`."""
         sources = {topic: name for name, topic in self._cameras.items()}
         if self._imu:
             sources[self._imu] = IMU
@@ -117,10 +117,10 @@ class BagRecording(Recording):
         return rows
 
     def _open(self) -> AbstractContextManager[Any]:
-        """A reader, which the end of a block closes.
+        """Return a context manager with an open reader.
 
         Raises:
-            RecordingError: it is none, or is damaged.
+            RecordingError: the file is not a bag, or is damaged.
         """
         require("recordings")
         from rosbags.highlevel import AnyReader
@@ -134,10 +134,10 @@ class BagRecording(Recording):
         return closing(reader)
 
     def _value(self, source: str, connection: Any, message: Any) -> ImuSample | CameraImage:
-        """A message as a value.
+        """Convert a message to a value.
 
         Raises:
-            PerchError: an image of an encoding that is not known here, or that cannot be decoded.
+            PerchError: an image has an unknown encoding or cannot be decoded.
         """
         if source == IMU:
             return imu_value(message)._replace(frame="imu_link")
@@ -154,7 +154,7 @@ def _numbers(pose: Any) -> tuple[float, ...]:
 
 
 def _topic(wanted: str, there: set[str]) -> str:
-    """The topic that is wanted, with or without slash, namespace and `/compressed`; empty: none."""
+    """Return the available topic that matches the wanted one, up to slash, namespace and `/compressed`; empty if none does."""
     end = "/" + wanted.lstrip("/")
     names = (end, f"{end}/compressed")
     exact = [topic for topic in names if topic in there]
@@ -162,6 +162,6 @@ def _topic(wanted: str, there: set[str]) -> str:
 
 
 def _camera_of(topic: str) -> str:
-    """A name for the camera of a topic: `down` of camera_down/image_raw; else its whole name."""
+    """Return a camera name for a topic: `down` for camera_down/image_raw; otherwise from the whole topic."""
     first = topic.strip("/").removesuffix("/compressed").removesuffix("/image_raw")
     return first.rpartition("camera_")[2].replace("/", "_") or "camera"

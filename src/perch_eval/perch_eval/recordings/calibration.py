@@ -1,4 +1,4 @@
-"""Calibration files of others as sensor files: Kalibr's camera chain and IMU, EuRoC's `sensor.yaml`."""
+"""Conversion of other calibration formats to sensor files: Kalibr's camera chain and IMU, EuRoC's `sensor.yaml`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ IMU_KEYS = {"accel_noise_density": "accelerometer_noise_density", "gyro_noise_de
 
 
 def from_kalibr(cameras: Path, imu: Path | None, name: str, R_BI: np.ndarray = np.eye(3)) -> Sensors:
-    """A Kalibr calibration as a sensor file.
+    """Convert a Kalibr calibration.
 
     Args:
         cameras: `camchain-imucam.yaml`: with `T_cam_imu` of every camera.
@@ -32,7 +32,7 @@ def from_kalibr(cameras: Path, imu: Path | None, name: str, R_BI: np.ndarray = n
         R_BI: axes of the IMU in the body, shape (3, 3).
 
     Raises:
-        ConfigError: a file cannot be read, lacks something, or has a model that is not known here.
+        ConfigError: a file cannot be read, is incomplete, or has an unknown camera model.
     """
     chain = _mapping(cameras)
     found = {key: value for key, value in chain.items() if re.fullmatch(r"cam\d+", key)}
@@ -47,10 +47,10 @@ def from_kalibr(cameras: Path, imu: Path | None, name: str, R_BI: np.ndarray = n
 
 
 def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
-    """The `sensor.yaml` files of a folder in the ASL format; B is the body of their `T_BS`, which must be the IMU's.
+    """Convert the `sensor.yaml` files of a folder in the ASL format. The origin of the body is the IMU.
 
     Raises:
-        ConfigError: a file cannot be read, lacks something, or has a model that is not known here.
+        ConfigError: a file cannot be read, is incomplete, or has an unknown camera model.
     """
     name = root.resolve().parent.name if root.name == "mav0" else root.resolve().name
     out: dict[str, Any] = {"name": re.sub(r"[^\w.+-]", "_", name) or "asl", "cameras": {}}
@@ -67,7 +67,7 @@ def from_asl(root: Path, R_BI: np.ndarray = np.eye(3)) -> Sensors:
 
 
 def in_body(file: Path) -> np.ndarray:
-    """T_BS of a `sensor.yaml`, shape (4, 4); the unit matrix where it has none, or is not there.
+    """Return T_BS of a `sensor.yaml`, shape (4, 4); the identity if the entry or the file is missing.
 
     Raises:
         ConfigError: it cannot be read, or is no rigid transform.
@@ -77,7 +77,7 @@ def in_body(file: Path) -> np.ndarray:
 
 
 def to_yaml(sensors: Sensors, comment: str = "") -> str:
-    """A sensor file's text; what has its default is left out."""
+    """Return the text of a sensor file; values equal to their default are left out."""
     body = yaml.safe_dump(_plain(sensors), sort_keys=False, default_flow_style=None, width=120)
     return "".join(f"# {line}\n" for line in comment.splitlines()) + body
 
@@ -107,7 +107,7 @@ def _kalibr_camera(source: str, key: str, c: Any, R_BI: np.ndarray) -> dict[str,
 
 
 def _camera(source: str, dot: str, c: dict[str, Any], distortion: Any, T_IC: np.ndarray, R_BI: np.ndarray) -> dict[str, Any]:
-    """What both formats share."""
+    """Convert the camera entries that both formats share."""
     kind = str(c.get("camera_model", "pinhole"))
     if kind != "pinhole":
         raise ConfigError(source, f"{dot}camera_model", f"{kind!r} is not pinhole (with radtan, equidistant or no distortion)")
@@ -158,7 +158,7 @@ def _number(source: str, key: str, value: Any) -> float:
 
 
 def _transform(source: str, key: str, value: Any) -> np.ndarray:
-    """A rigid transform, (4, 4), whose rotation is made exact: files have some ten digits."""
+    """Parse a rigid transform, (4, 4); its rotation is orthonormalised, as files have some ten digits."""
     try:
         T = np.array(value["data"] if isinstance(value, dict) else value, float).reshape(4, 4)
     except (KeyError, TypeError, ValueError):

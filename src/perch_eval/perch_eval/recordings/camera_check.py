@@ -1,4 +1,4 @@
-"""A camera's images judged: size, rate, exposure, sharpness, texture; and its clock and mounting against the IMU's, by the turns that both see."""
+"""Checks of a camera: size, rate, exposure, sharpness, texture of images; clock and mounting against the IMU by angular rates."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ALIKE, UNLIKE = 0.25, 0.7  # what images and gyro may not share of a turn, as a 
 
 
 class Looker:
-    """What is kept of a camera's images."""
+    """Collects stamps and sampled image properties of a camera."""
     def __init__(self, total: int) -> None:
         self.stamps: list[int] = []
         self.delays: list[int] = []
@@ -34,7 +34,7 @@ class Looker:
         self._every = max(1, total // LOOKED_AT)
 
     def take(self, image: CameraImage, arrived: int) -> None:
-        """An image, and when it was recorded [ns]."""
+        """Add an image and the time of its recording [ns]."""
         if len(self.stamps) % self._every == 0:
             pixels = image.pixels()
             if pixels is not None:
@@ -45,9 +45,9 @@ class Looker:
 
 
 def look_at(pixels: np.ndarray) -> tuple[float, ...]:
-    """Brightness, share of saturated pixels, width of its sharper edges [px], number of corners of an image uint8 (h, w) or (h, w, 3).
+    """Return brightness, share of saturated pixels, edge width [px] and number of corners of an image, uint8 (h, w) or (h, w, 3).
 
-    The width of an edge is its step, over three pixels to either side, by its steepest slope; the median of the image's steepest.
+    The width of an edge is its step, over three pixels to either side, over its slope; median of the steepest 2 % of pixels.
     """
     grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
     slope = 0.125 * cv2.magnitude(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
@@ -108,7 +108,7 @@ def check_camera(report: Report, name: str, looker: Looker, imu_stamps: np.ndarr
 
 
 def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: np.ndarray, sensors: Sensors, R_BI: np.ndarray) -> None:
-    """Time offset and rotation between each camera and the IMU, by which the turns that both see fit best."""
+    """Check time offset and rotation between each camera and the IMU by the best fit of their angular rates."""
     begin = _liveliest(stamps, imu[:, :3])
     end = begin + round(SPAN * 1e9)
     turns = {name: CameraTurns(sensors.cameras[name].camera) for name in recording.images if name in sensors.cameras}
@@ -127,7 +127,7 @@ def check_clocks(report: Report, recording: Recording, stamps: np.ndarray, imu: 
 
 
 def _check_clock(report: Report, name: str, turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray, told: float) -> None:
-    """Mounting and clock of one camera; `told` is the offset of the sensor file [s], the others are those of `felt_rates`."""
+    """Check mounting and clock of one camera; `told` is the offset in the sensor file [s], the others are as in `felt_rates`."""
     rate, felt = turns[:, 2:], felt_rates(turns, stamps, gyro_C)
     R, unlike = mounting(rate, felt)
     if unlike < ALIKE:
@@ -152,17 +152,17 @@ def _check_clock(report: Report, name: str, turns: np.ndarray, stamps: np.ndarra
 
 
 def _liveliest(stamps: np.ndarray, gyro: np.ndarray) -> int:
-    """Where the stretch of `SPAN` with the most varied turns begins [ns]."""
+    """Return the start of the interval of length `SPAN` in which the angular rate varies most [ns]."""
     edges = np.arange(stamps[0], max(stamps[-1] - round(SPAN * 1e9), stamps[0] + 1), 1_000_000_000)
     spans = [gyro[slice(*np.searchsorted(stamps, [edge, edge + round(SPAN * 1e9)]))] for edge in edges]
     return int(edges[int(np.argmax([np.linalg.norm(span - span.mean(axis=0), axis=1).mean() for span in spans]))])
 
 
 def felt_rates(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> np.ndarray:
-    """Mean rates of the gyro between the images' stamps, for each of `OFFSETS` by which these may be late.
+    """Return the gyro's mean rates between image stamps, for each offset in `OFFSETS` of these stamps.
 
     Args:
-        turns: stamp before, stamp after [s], mean rate between in C [rad/s], shape (n, 5).
+        turns: stamps of two images [s], mean rate between them in C [rad/s], shape (n, 5).
         stamps: of the gyro on the same clock [s], shape (m,).
         gyro_C: angular rate in the axes of C [rad/s], shape (m, 3).
 
@@ -175,9 +175,9 @@ def felt_rates(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> np.
 
 
 def mounting(rate: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray, float]:
-    """Rotation that best turns the camera's rates into the gyro's, at the best offset, and the share of the rates that it does not explain.
+    """Return the rotation that best maps the camera's rates to the gyro's, at the best offset, and the unexplained share.
 
-    The share is infinite where they turn about one axis only. For the arguments see `clock_offset`.
+    The share is infinite if the rotation is about one axis only. For the arguments see `clock_offset`.
     """
     rate, felt = rate - rate.mean(axis=0), felt - felt.mean(axis=1, keepdims=True)
     size = np.linalg.svd(rate, compute_uv=False)
@@ -188,15 +188,15 @@ def mounting(rate: np.ndarray, felt: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def clock_offset(rate: np.ndarray, felt: np.ndarray, times: np.ndarray) -> tuple[float, float]:
-    """By how much the images' stamps are late against the gyro's, and how alike the turns are then.
+    """Estimate the time offset of the image stamps against the gyro's, and its uncertainty.
 
     Args:
         rate: of the camera [rad/s], shape (n, 3).
-        felt: of the gyro at each offset, as `felt_rates` gives them, shape (k, n, 3).
+        felt: of the gyro at each offset, from `felt_rates` [rad/s], shape (k, n, 3).
         times: of the rates [s], shape (n,).
 
     Returns:
-        Stamp minus IMU time [s], by the axis where the rates are most alike, and its 1 sigma: the rates' difference over their slope.
+        Stamp minus IMU time [s], from the axis with the least uncertainty, and its 1 sigma: rate difference over slope.
     """
     slope = np.abs(np.gradient(felt, times, axis=1)).mean(axis=1)
     sigma = (rate - felt).std(axis=1) / np.maximum(slope, 1e-9) / np.sqrt(len(rate) / CORRELATED)

@@ -1,4 +1,4 @@
-"""What would make perception fail on a recording, said before it fails: rates, gaps, jitter, units, noise, exposure, blur, clocks."""
+"""Checks for what would make perception fail on a recording: rates, gaps, jitter, units, noise, exposure, blur, clocks."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ DAY = 86_400_000_000_000  # [ns]
 
 
 def check(recording: Recording, events: Iterator[Event] | None = None) -> Report:
-    """Read a recording once and judge it.
+    """Check a recording.
 
     Args:
-        recording: what is judged, against its sensor file where it has one.
-        events: the recording's, where somebody counts them on their way.
+        recording: compared with its sensor file if it has one.
+        events: of the recording, for example with a progress display; None: they are read here.
     """
     report, sensors = Report(), recording.sensors
     stamps, samples = [], []

@@ -87,7 +87,7 @@ def _perceive(args: argparse.Namespace) -> int:
 
 
 def _choose(sensors: Sensors, recording: Recording, given: str | None, preferred: str, option: str) -> str:
-    """A camera: the one that is given, else one with the usual name, else the first."""
+    """Return a camera: the given one, else the preferred one, else the first."""
     there = [name for name in sensors.cameras if recording.images.get(name)]
     if not there:
         raise PerchError(f"{recording.path}: there is no image")
@@ -132,7 +132,7 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
 
 
 def _tell_motion(told: Told, perception: Perception, vio: Trajectory, truth: Trajectory | None) -> None:
-    """How VIO and estimator fared."""
+    """Add the results of VIO and estimator to the report."""
     frames, states = perception.vio.frames, perception.states
     outcomes = {name: sum(f.outcome == name for f in frames) for name in dict.fromkeys(f.outcome for f in frames)}
     cost = 1e3 * np.array([f.cost for f in frames]) if frames else np.zeros(1)
@@ -167,7 +167,7 @@ def _tell_motion(told: Told, perception: Perception, vio: Trajectory, truth: Tra
 
 
 def _tell_surroundings(told: Told, perception: Perception) -> None:
-    """What was found of board and wires."""
+    """Add the results on board and wires to the report."""
     if perception.sightings:
         told.figures["target"], words = _board(perception)
         told.rows.append(("board", words))
@@ -182,7 +182,7 @@ def _tell_surroundings(told: Told, perception: Perception) -> None:
 
 
 def _board(perception: Perception) -> tuple[dict[str, float], str]:
-    """What is told of the board, which does not move: for JSON and in words."""
+    """Return the results on the board, which is static, as figures for JSON and in words."""
     seen = [s for s in perception.sightings if s.pose_camera is not None]
     figures = {"images": len(perception.sightings), "found": len(seen), "poses": len(perception.targets), "reprojection_rms_px": np.nan}
     words = f"found in {len(seen)} of {len(perception.sightings)} images"

@@ -1,4 +1,4 @@
-"""Pictures for a report: what was found, drawn onto images, and a few of a stream whose length is not known."""
+"""Pictures for a report: detections drawn onto images, and a gallery that samples a stream of unknown length."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def canvas(pixels: np.ndarray) -> np.ndarray:
 
 
 def draw_board(image: np.ndarray, camera: Camera, board: TagBoard, pose: TargetPose, ids: Iterable[int]) -> None:
-    """Outlines of the tags that were used and the axes of S, where the pose puts them."""
+    """Draw the outlines of the used tags and the axes of S at a pose."""
     R = so3.quat_to_matrix(pose.q_WS)
     for number, corners_S in zip(board.ids, board.corners_S):
         if number in set(ids):
@@ -36,7 +36,7 @@ def draw_board(image: np.ndarray, camera: Camera, board: TagBoard, pose: TargetP
 
 
 def draw_tags(image: np.ndarray, tags: Sequence[tuple[int, np.ndarray]]) -> None:
-    """Tags by number and corners [px], shape (4, 2)."""
+    """Draw tags, given by number and corners [px], shape (4, 2)."""
     for number, corners in tags:
         _line(image, corners, TAG, closed=True)
         cv2.circle(image, _whole(corners[0]), 3, TAG, -1)
@@ -44,13 +44,13 @@ def draw_tags(image: np.ndarray, tags: Sequence[tuple[int, np.ndarray]]) -> None
 
 
 def draw_wires(image: np.ndarray, camera: Camera, wires: Sequence[LineSighting]) -> None:
-    """Wires as they were detected."""
+    """Draw detected wires."""
     for wire in wires:
         _line(image, camera.project(wire.rays_C)[0], WIRE)
 
 
 def caption(image: np.ndarray, text: str) -> np.ndarray:
-    """The image with a line of text."""
+    """Write a line of text onto an image and return it."""
     _text(image, text, (8, 18), TEXT)
     return image
 
@@ -84,7 +84,7 @@ class Shown(NamedTuple):
 
 
 class Gallery:
-    """Takes every n-th picture that is offered; when it is full, every other goes and n is doubled.
+    """Keeps every n-th picture that is offered; when it is full, every other one is dropped and n is doubled.
 
     Attributes:
         shown: the pictures, in their order.
@@ -94,11 +94,11 @@ class Gallery:
         self._most, self._step, self._offered = most, 1, 0
 
     def due(self, within: int = 1) -> bool:
-        """Whether the next picture, or one of the next few, will be taken."""
+        """Return whether one of the next `within` pictures will be kept."""
         return -self._offered % self._step < within
 
     def offer(self, draw: Callable[[], Shown | None]) -> None:
-        """Draw and take the next picture, if it is due and there is one."""
+        """Draw and keep the next picture, if it is due and available."""
         picture = draw() if self.due() else None
         self._offered += 1
         if picture is None:

@@ -19,21 +19,21 @@ MOST_OPEN = 0.2   # by which errors may turn a path's shape about itself: beyond
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How far an estimate is from the truth.
+    """Errors of an estimated trajectory against the true one.
 
     Attributes:
-        figures: for a table or JSON, of n poses; nan: not known.
+        figures: for a table or JSON, of n poses; nan: not available.
             compared_s, path_m: duration, and length of the true path.
             ate_rmse_m: absolute trajectory error after the best rigid alignment; nan: the motion is too short to be aligned.
-            ate_rmse_deg: the same of the attitude; nan also where the path is so straight that its shape leaves its attitude open.
-            rpe_rmse_m, rpe_rmse_deg: error of the motion over `rpe_delta_m` of path, and of its attitude; nan likewise.
-            scale: of the estimate against the truth; nan likewise.
-            final_error_m, largest_error_m, drift_percent, attitude_rms_deg: of `error` and `turn`.
-            nees_position_mean: of `nees`.
+            ate_rmse_deg: the same of the attitude; nan also if the path is too straight for its shape to determine the attitude.
+            rpe_rmse_m, rpe_rmse_deg: relative pose error over `rpe_delta_m` of path, in position and attitude; nan likewise.
+            scale: of the estimate relative to the truth; nan likewise.
+            final_error_m, largest_error_m, drift_percent, attitude_rms_deg: from `error` and `turn`.
+            nees_position_mean: mean of `nees`.
         stamps: of the compared poses [ns], shape (n,).
-        error: estimate minus truth of the position, in the estimate's W, both beginning together with the same heading [m], shape (n, 3).
-        turn: rotation vector in W of the estimate against the truth, likewise [rad], shape (n, 3).
-        nees: e^T P^-1 e of the position, 3 in the mean for an honest filter, shape (n,); nan where there is no covariance.
+        error: position, estimate minus truth, in the estimate's W, with equal start positions and headings [m], shape (n, 3).
+        turn: attitude error, rotation vector in W of the estimate relative to the truth, likewise [rad], shape (n, 3).
+        nees: e^T P^-1 e of the position, mean 3 for a consistent filter, shape (n,); nan at the start and without covariances.
         truth_W: the true path in the estimate's W, shape (n, 3).
     """
 
@@ -50,11 +50,11 @@ def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | 
 
     Args:
         estimate: n poses.
-        truth: of the same body, at any stamps of the same clock.
+        truth: poses of the same body, at any stamps of the same clock.
         covariances: of the estimate's position in its W [m^2], shape (n, 3, 3).
 
     Raises:
-        RecordingError: hardly any pose has a true one at its stamp.
+        RecordingError: fewer than `LEAST_POSES` poses have a true pose at their stamp.
     """
     true, kept = truth.at(estimate.stamps)
     if kept.sum() < LEAST_POSES:
@@ -78,7 +78,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | 
 
 
 def _by_evo(estimate: Trajectory, true: Trajectory) -> dict[str, float]:
-    """ATE, RPE and scale, as `Evaluation.figures` has them; nan where the motion is too short."""
+    """Return ATE, RPE and scale as in `Evaluation.figures`; nan if the motion is too short."""
     from evo.core import metrics
     from evo.core.geometry import GeometryException
     from evo.core.metrics import MetricsException, PoseRelation, Unit
@@ -109,9 +109,9 @@ def _by_evo(estimate: Trajectory, true: Trajectory) -> dict[str, float]:
 
 
 def _breadth(p: np.ndarray) -> float:
-    """Rms distance of positions (n, 3) from the straight line that is nearest to them [m].
+    """Return the rms distance of positions (n, 3) from their best-fitting straight line [m].
 
-    A turn about that line by delta moves them by delta times this, so errors of rms e leave it open by e / breadth.
+    A rotation about that line by delta moves them by delta times this, so rms errors e leave it uncertain by e / breadth.
     """
     spread = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
     return float(np.hypot(spread[1], spread[2]) / np.sqrt(len(p)))

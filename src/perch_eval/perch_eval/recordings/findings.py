@@ -1,4 +1,4 @@
-"""Findings of a check: what would make perception fail, and what it rests on."""
+"""Findings of a check: what would make perception fail, with the underlying figures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Report:
 
 
 def check_rhythm(report: Report, about: str, stamps: np.ndarray, least: float, wanted: float, told: float | None) -> float:
-    """Judge the rate, the jitter (1 sigma of an interval, in periods) and the gaps of ascending stamps, three or more; the rate [Hz]."""
+    """Check rate, jitter (1 sigma of an interval, in periods) and gaps of ascending stamps (three or more); return rate [Hz]."""
     intervals = 1e-9 * np.diff(stamps)
     reach = min(9, len(intervals))  # stamps may come in batches
     period = float(np.median(stamps[reach:] - stamps[:-reach])) * 1e-9 / reach

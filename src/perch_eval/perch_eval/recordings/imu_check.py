@@ -1,4 +1,4 @@
-"""An IMU's samples judged: units, range, rest, biases and noise."""
+"""Checks of IMU samples: units, range, rest, biases and noise."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSe
 
 
 def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor | None) -> None:
-    """Noise densities at rest, from the Allan deviation, against those of the sensor file."""
+    """Check the noise densities at rest, from the Allan deviation, against those of the sensor file."""
     if len(imu) < 100:
         return
     tau, deviation = allan_deviation(imu, rate)
@@ -82,16 +82,16 @@ def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor
 
 
 def stretches_at_rest(stamps: np.ndarray, imu: np.ndarray) -> list[tuple[int, int]]:
-    """The stretches at rest, one after the other.
+    """Return the intervals at rest, in order.
 
-    At rest the mean over a window stays what it was. A bias, however large, does not count, nor does the shaking of idling rotors.
+    At rest, the mean over a window is constant. Biases of any size and the vibration of idling rotors are tolerated.
 
     Args:
         stamps: ascending [ns], shape (n,).
         imu: angular rate [rad/s] and specific force [m/s^2], shape (n, 6).
 
     Returns:
-        Index of the first sample of each, and of the one after its last.
+        Index of the first sample of each interval, and of the one after its last.
     """
     edges = np.searchsorted(stamps, np.arange(stamps[0], stamps[-1], round(STILL_WINDOW * 1e9)))
     parts = [imu[a:b] for a, b in zip(edges[:-1], edges[1:])]

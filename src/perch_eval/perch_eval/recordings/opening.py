@@ -1,4 +1,4 @@
-"""Which kind of recording a path is: a bag, a folder in the ASL format, or images, of which nothing is known but what each one shows."""
+"""Opening of a recording by its kind: a bag, a folder in the ASL format, or single images without stamps."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ PERIOD = 1_000_000_000  # between the stamps that the images are given [ns]
 
 
 def pictures_in(path: Path) -> list[Path]:
-    """The image files of a folder in the order of their names; of a file, itself."""
+    """Return the image files of a folder in the order of their names, or an image file itself."""
     files = [path] if path.is_file() else sorted(path.iterdir()) if path.is_dir() else []
     return [file for file in files if file.suffix.lower() in PICTURES and file.is_file()]
 
 
 class PictureFolder(Recording):
-    """Images without a time of their own."""
+    """Image files without stamps."""
     def __init__(self, path: Path, sensors: Sensors | None) -> None:
         """
         Raises:
@@ -34,7 +34,7 @@ class PictureFolder(Recording):
         self.images = {self.camera: len(self.files)}
 
     def events(self) -> Iterator[Event]:
-        """The images in the order of their names, one a second; those that are none are left out and said in `damage`."""
+        """Yield the images in the order of their names, one per second; undecodable files are left out and listed in `damage`."""
         bad = []
         for number, file in enumerate(self.files):
             try:
@@ -47,11 +47,11 @@ class PictureFolder(Recording):
 
 
 def open_recording(path: Path, sensors: Sensors | None) -> Recording:
-    """The recording at a path.
+    """Open the recording at a path.
 
     Args:
         path: a bag, a folder in the ASL format, a folder of images or an image.
-        sensors: its calibration; None: the one that it brings along, or none.
+        sensors: its calibration; None: the recording's own, if there is one.
 
     Raises:
         RecordingError: it is none of these, or cannot be read.

@@ -1,4 +1,4 @@
-"""The components of perception in a row, as the graph has them: whoever emits is heard at once, and nothing waits for a clock."""
+"""The perception components, connected as in the ROS graph: outputs are delivered at once, without a clock."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ TAIL = 8  # frames that a picture of tracks looks back
 
 @dataclass(frozen=True)
 class Frame:
-    """What VIO made of a frame.
+    """Result of VIO for one frame.
 
     Attributes:
         stamp: of the image [ns].
         outcome: name of the `FrameOutcome`.
         features, used, refused: tracks, and observations that changed the state or were refused.
-        restarts: so far.
+        restarts: number of restarts so far.
         cost: CPU time [s].
     """
 
@@ -52,13 +52,13 @@ class Frame:
 
 
 class _Vio(VioComponent):
-    """Notes every frame, and draws some."""
+    """VIO component that records every frame and draws some."""
 
     frames: list[Frame]
     gallery: Gallery
 
     def use(self, image: CameraImage) -> None:
-        """As it does."""
+        """Process an image as the base class does; record the frame and offer a picture."""
         drawn: list[CameraImage] = []
         self.debug_image.receivers[:] = [drawn.append] if self.gallery.due(TAIL) else []
         begin = time.process_time()
@@ -76,14 +76,14 @@ class _Vio(VioComponent):
 
 
 class _Target(TargetLocalizer):
-    """Draws some of the images in which it finds the board, and a few in which it does not."""
+    """Target localiser that draws some of the images with the board found, and a few without."""
 
     sightings: list[TargetSighting]
     found: Gallery
     missed: Gallery
 
     def look(self, image: CameraImage, exposed: float) -> None:
-        """As it does."""
+        """Process an image as the base class does and offer a picture."""
         super().look(image, exposed)
         seen = self.sightings[-1]
         (self.missed if seen.pose_camera is None else self.found).offer(lambda: self._drawn(image, seen))
@@ -101,12 +101,12 @@ class _Target(TargetLocalizer):
 
 
 class _Wires(PowerlineMapper):
-    """Draws some of the images, with the wires that are detected in them."""
+    """Powerline mapper that draws some of the images with the detected wires."""
 
     gallery: Gallery
 
     def look(self, image: CameraImage, exposed: float) -> None:
-        """As it does."""
+        """Process an image as the base class does and offer a picture."""
         super().look(image, exposed)
         self.gallery.offer(lambda: self._drawn(image))
 
@@ -122,16 +122,16 @@ class _Wires(PowerlineMapper):
 
 
 class Perception:
-    """VIO, estimator, target localiser and powerline mapper, and what they have said.
+    """VIO, estimator, target localiser and powerline mapper, and their outputs.
 
     Attributes:
         vio: the component of VIO.
         states: of VIO.
-        odometry: the estimator's, one for each IMU sample from when it knows where it is.
-        health: the estimator's word on itself.
+        odometry: of the estimator, one per IMU sample while its position sigma is below `KNOWN`.
+        health: of the estimator.
         sightings, targets: of the target localiser.
-        lines: the last map; None: there is none.
-        log: (node, level, text), each text once.
+        lines: the newest powerline map; None: none yet.
+        log: (node, level, text) of warnings and errors -> number of occurrences.
     """
 
     def __init__(self, sensors: Sensors, file: str, down: str, front: str, board: str, overrides: Mapping[str, Mapping[str, Any]],
@@ -180,7 +180,7 @@ class Perception:
             self.estimator.odometry.receivers.append(self.wires.on_odometry)
 
     def take(self, event: Event) -> None:
-        """Give the components what a sensor said."""
+        """Pass a sensor's value to the components."""
         value = event.value
         if isinstance(value, ImuSample):
             self.estimator.on_imu(value)
@@ -192,7 +192,7 @@ class Perception:
                 component.on_image(value)
 
     def _make(self, node: str, cls: type[Component[Any]], given: Mapping[str, Any]) -> Any:
-        """A component with the parameters of its node; None where it is left out."""
+        """Create a component with the parameters of its node; None if it is left out."""
         if node in self._without:
             return None
         parameters = config.flattened(read_parameters(node)) | dict(given) | config.flattened(self._overrides.get(node, {}))

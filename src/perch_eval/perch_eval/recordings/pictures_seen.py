@@ -1,4 +1,4 @@
-"""What single images show: tags and the board, wires; without an IMU, and where there is no calibration without a camera either."""
+"""Detections in single images, without an IMU: tags, wires, and, if the camera is calibrated, the pose of the board."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ GUESSED_FOCAL = 0.8  # of a camera that nobody has calibrated, as a share of the
 
 @dataclass(frozen=True)
 class Seen:
-    """What one image shows.
+    """Detections in one image.
 
     Attributes:
         tags: numbers and corners [px], shape (4, 2), of all tags of the family.
         board: pose of the board in the camera; None: it was not found.
-        message: why it was not, for people.
+        message: reason why it was not found.
         wires: arcs of straight wires.
-        mount: the camera, guessed where nobody calibrated it.
+        mount: the camera; guessed if it is not calibrated.
     """
 
     tags: Sequence[tuple[int, np.ndarray]]
@@ -40,7 +40,7 @@ class Seen:
     mount: CameraMount
 
     def figures(self) -> dict[str, Any]:
-        """For JSON: lengths in m, angles as quaternions xyzw, pixels as OpenCV counts them."""
+        """Return a mapping for JSON: lengths in m, attitudes as quaternions xyzw, pixels in OpenCV's convention."""
         pixels = [np.round(self.mount.camera.project(wire.rays_C)[0], 2).tolist() for wire in self.wires]
         out: dict[str, Any] = {
             "tags": [{"id": number, "corners": np.round(corners, 3).tolist()} for number, corners in self.tags], "message": self.message,
@@ -52,20 +52,20 @@ class Seen:
 
 
 def guessed_mount(name: str, width: int, height: int) -> CameraMount:
-    """A camera without distortion, as a webcam has it."""
+    """Return a guessed camera without distortion, similar to a webcam."""
     focal = GUESSED_FOCAL * width
     return CameraMount(name, PinholeCamera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), np.zeros(3), np.eye(3))
 
 
 def look(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDetectionConfig, calibrated: bool) -> Seen:
-    """Look at one image.
+    """Detect tags, board and wires in one image.
 
     Args:
         image: of the camera's size.
         mount: the camera.
-        board: whose pose is wanted.
-        wires: what counts as a wire.
-        calibrated: the camera is known; otherwise no pose can be told.
+        board: whose pose is estimated.
+        wires: settings of the detection of wires.
+        calibrated: whether the camera is calibrated; otherwise no pose is estimated.
 
     Raises:
         ImageError: it is not of the camera's size or has no pixels.
@@ -78,7 +78,7 @@ def look(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDet
 
 
 def find_tags(grey: np.ndarray, camera: Camera, board: TagBoard) -> list[tuple[int, np.ndarray]]:
-    """Number and corners (TL, TR, BR, BL) [px], (4, 2), of every tag of a board's family in a grey image, each time that it is there."""
+    """Return number and corners (TL, TR, BR, BL) [px], (4, 2), of tags of a board's family in a grey image, repeated ones too."""
     side = 0.1 * min(board.pad_size)
     anything = replace(board, grid=None, tags=tuple(Tag(number, (0.0, 0.0), side) for number in range(FAMILIES[board.family][1])))
     detection = TagDetector(anything, camera).search(grey)
@@ -87,7 +87,7 @@ def find_tags(grey: np.ndarray, camera: Camera, board: TagBoard) -> list[tuple[i
 
 
 def drawn(image: CameraImage, seen: Seen, board: TagBoard, name: str) -> Shown:
-    """The image with what was found in it."""
+    """Return the image with its detections drawn."""
     picture = canvas(mono_image(image, seen.mount.camera))
     draw_wires(picture, seen.mount.camera, seen.wires)
     draw_tags(picture, seen.tags)

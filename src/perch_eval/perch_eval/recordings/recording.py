@@ -1,4 +1,4 @@
-"""A recording as its readers give it: what the IMU and the cameras said, in the order in which it arrived."""
+"""Interface of a recording: IMU samples and camera images in the order of their arrival."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".
 
 
 class RecordingError(PerchError):
-    """A recording, or a file that belongs to it, cannot be read, or does not hold what is asked for."""
+    """Raised when a recording, or a file that belongs to it, cannot be read or lacks requested data."""
 
 
 class Event(NamedTuple):
-    """Something that a sensor said.
+    """A value of a sensor.
 
     Attributes:
         source: `imu`, or the name of the camera.
-        arrived: when it was recorded [ns]; its stamp where that is not known.
-        value: what it said, in the sensor's own axes.
+        arrived: time of recording [ns]; the stamp if that is unknown.
+        value: sample or image, in the sensor's own axes.
     """
 
     source: str
@@ -47,7 +47,7 @@ class Recording(ABC):
         sensors: its calibration; None: there is none.
         images: number of images by camera.
         samples: number of IMU samples.
-        damage: why it could not be read to its end, known once it has been read; empty: it could.
+        damage: reason why it could not be read completely, valid after reading; empty: it could.
     """
     def __init__(self, path: Path, sensors: Sensors | None) -> None:
         self.path, self.sensors = path, sensors
@@ -57,36 +57,36 @@ class Recording(ABC):
 
     @abstractmethod
     def events(self) -> Iterator[Event]:
-        """Everything in the order in which it arrived; each call begins anew."""
+        """Yield all events in the order of their arrival; each call starts from the beginning."""
 
     def read(self) -> Iterator[Event]:
-        """The events, counted on their way."""
+        """Yield the events with a progress display."""
         return counted(self.events(), self.samples + sum(self.images.values()), what="messages")
 
     @property
     def truth(self) -> Path | None:
-        """The file with the true motion that it brings along; None: none."""
+        """File of the true motion that belongs to the recording; None if there is none."""
         return None
 
 
 class _Picture(CameraImage):
-    """An image on file, decoded when somebody looks at it."""
+    """An image file that is decoded when its pixels are read."""
 
     __slots__ = ("path", )
     path: Path
 
 
 def picture(path: Path, stamp: int, name: str, camera: CameraSensor | None) -> CameraImage:
-    """An image file as a camera's image; grey unless the camera delivers colour, 16 bits as their upper 8.
+    """Return an image file as a camera's image; in colour unless the camera is grey, 16 bits reduced to the upper 8.
 
     Args:
-        path: of the file; one that cannot be decoded is found out when somebody looks.
+        path: of the file; if `camera` is given, the file is decoded only when the pixels are read.
         stamp: [ns].
         name: of the camera.
-        camera: what it is; None: as the file has it.
+        camera: the camera; None: the size is that of the file.
 
     Raises:
-        RecordingError: the size is not given and the file cannot be read.
+        RecordingError: no camera is given and the file cannot be decoded.
     """
     flag, encoding = (cv2.IMREAD_COLOR, "bgr8") if camera is None or camera.colour else (cv2.IMREAD_GRAYSCALE, "mono8")
     if camera is None:

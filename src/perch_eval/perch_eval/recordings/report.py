@@ -1,4 +1,4 @@
-"""`report.html` and `report.json` of a recording: what was found, how far off it was, and what it looked like."""
+"""`report.html` and `report.json` of a recording: results, errors, plots and pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLOURS = {"TRACKING": "#2ca02c", "RESTING": "#1f77b4", "LEAVING": "#17becf", "B
 
 @dataclass
 class Told:
-    """What is told of a recording: figures for JSON, rows of words, plots and pictures by title."""
+    """Content of the report on a recording: figures for JSON, rows of text, plots and pictures by title."""
 
     figures: dict[str, Any]
     rows: list[tuple[str, str]]
@@ -33,7 +33,7 @@ class Told:
     pictures: dict[str, Sequence[Shown]] = field(default_factory=dict)
 
     def write(self, folder: Path, recording: Recording, findings: Sequence[Finding] = (), log: Mapping[tuple[str, str, str], int] = {}) -> None:
-        """Into `report.json` and `report.html`, and to the terminal; with the findings of the check, and (node, level, text) -> how often."""
+        """Write `report.json` and `report.html`, and print rows and findings; `log`: (node, level, text) -> count."""
         write_json(folder / "report.json", self.figures)
         lines = ((f"{node}: {level}", message, f"{n} times" if n > 1 else "") for (node, level, message), n in log.items())
         (folder / "report.html").write_text(page(
@@ -65,7 +65,7 @@ def path_figure(estimate: Trajectory, evaluation: Evaluation | None) -> Figure:
 
 
 def frames_figure(frames: Sequence[Frame]) -> Figure:
-    """Tracks over time; the background says what VIO made of each frame."""
+    """Plot tracks over time; the background colour shows VIO's outcome of each frame."""
     figure = Figure(figsize=(11, 3.2), layout="constrained")
     axes = figure.subplots()
     t = 1e-9 * np.array([f.stamp - frames[0].stamp for f in frames])
@@ -85,7 +85,7 @@ def frames_figure(frames: Sequence[Frame]) -> Figure:
 
 
 def bias_figure(perception: Perception) -> Figure:
-    """The biases as VIO estimates them, with 3 sigma."""
+    """Plot the biases estimated by VIO, with 3 sigma."""
     states = perception.states
     t = 1e-9 * np.array([s.stamp - states[0].stamp for s in states])
     sigma = np.sqrt(np.array([np.diag(s.covariance) for s in states]))
@@ -103,7 +103,7 @@ def bias_figure(perception: Perception) -> Figure:
 
 
 def error_figure(evaluation: Evaluation, sigma: np.ndarray) -> Figure:
-    """Position error along each axis within 3 sigma, and the attitude's error.
+    """Plot the position error along each axis with 3 sigma, and the attitude error.
 
     Args:
         evaluation: of VIO's trajectory.

@@ -1,4 +1,4 @@
-"""Sensor files: made of a calibration, and a recording checked against one."""
+"""Make sensor files from calibrations, and check recordings against them."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _import(args: argparse.Namespace) -> int:
 
 
 def _renamed(sensors: Sensors, args: argparse.Namespace) -> Sensors:
-    """The sensors with the names that are wanted."""
+    """Return the sensors with the names of the command line."""
     names = dict(pair.split("=", 1) if "=" in pair else (pair, "") for pair in args.rename)
     for old, new in names.items():
         if old not in sensors.cameras or not new.isidentifier():

@@ -1,4 +1,4 @@
-"""Trajectories over time, their files (TUM, EuRoC's ground truth), and one at the stamps of another."""
+"""Trajectories over time, their interpolation at other stamps, and their files (TUM, EuRoC's ground truth)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Trajectory:
 
     @classmethod
     def of(cls, poses: Iterable[tuple[int, Any, Any]]) -> Trajectory:
-        """(stamp [ns], position, attitude) of each pose."""
+        """Make a trajectory of (stamp [ns], position, attitude) of each pose."""
         rows = list(poses)
         return cls(np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], float).reshape(-1, 3),
                    np.array([row[2] for row in rows], float).reshape(-1, 4))
@@ -45,25 +45,25 @@ class Trajectory:
 
     @property
     def length(self) -> float:
-        """Of the path [m]."""
+        """Length of the path [m]."""
         return float(np.linalg.norm(np.diff(self.p, axis=0), axis=1).sum())
 
     def chosen(self, rows: np.ndarray) -> Trajectory:
-        """Some of its poses, by index or mask."""
+        """Return the poses selected by indices or a mask."""
         return Trajectory(self.stamps[rows], self.p[rows], self.q[rows])
 
     def turned(self, q: np.ndarray, p: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> Trajectory:
-        """Of other axes in the same body: of attitude q, xyzw, and at p [m] in these."""
+        """Return the trajectory of another frame on the same body, with attitude q, xyzw, and position p [m] in this one."""
         return Trajectory(self.stamps, self.p + so3.quat_rotate(self.q, np.asarray(p)), so3.quat_multiply(self.q, q))
 
     def at(self, stamps: np.ndarray) -> tuple[Trajectory, np.ndarray]:
-        """Interpolated poses.
+        """Interpolate the poses.
 
         Args:
             stamps: ascending [ns], shape (m,).
 
         Returns:
-            The poses at those of the stamps that are neither outside nor inside a gap, and the mask of these, shape (m,).
+            The poses at the stamps that are within the trajectory and not in a gap, and the mask of these stamps, shape (m,).
         """
         if len(self) < 2:
             return self.chosen(np.zeros(0, int)), np.zeros(len(stamps), bool)
@@ -86,14 +86,14 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 
 def read_truth(recording: Recording, given: str | None) -> Trajectory | None:
-    """The true motion of a recording.
+    """Read the true motion of a recording.
 
     Args:
-        recording: the one that was read.
-        given: a file in TUM's or EuRoC's format, or a topic of the bag; None: what the recording brings along.
+        recording: the recording.
+        given: a file in TUM's or EuRoC's format, or a topic of the bag; None: the recording's own truth.
 
     Returns:
-        The motion; None: none is known.
+        The motion; None if there is none.
 
     Raises:
         RecordingError: it cannot be read.
@@ -133,13 +133,13 @@ def read_trajectory(path: Path) -> Trajectory:
 
 
 def _nanoseconds(text: str) -> int:
-    """Seconds as they are written, in whole nanoseconds; OpenVINS writes 1.40e18 nanoseconds into some of its files."""
+    """Convert seconds to whole nanoseconds; large values in exponent notation are nanoseconds, as in some files of OpenVINS."""
     value = Decimal(text)
     return int(value if "e" in text.lower() and value > 1e14 else value * 10**9)
 
 
 def _checked(source: str, stamps: np.ndarray, values: np.ndarray) -> Trajectory:
-    """Poses in the order of their stamps, each stamp once, quaternions of length one."""
+    """Check poses; return them in the order of their stamps, each stamp once, with unit quaternions."""
     if values.ndim != 2 or values.shape[1] != 7 or len(stamps) < 2:
         raise RecordingError(f"{source}: is no trajectory of two poses or more")
     stamps, order = np.unique(stamps, return_index=True)

@@ -1,4 +1,4 @@
-"""Shows a recorded flight: an animation, a stroboscopic picture, and plots."""
+"""Show a recorded flight as an animation or a stroboscopic picture, and as plots."""
 
 from __future__ import annotations
 
@@ -73,10 +73,10 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def span(view: FlightView, start: float | None, end: float | None, before: float = BEFORE, after: float = AFTER) -> tuple[float, float]:
-    """Time span to show [s]: what was asked for, or the perch with some time before and after it, or all.
+    """Return the time span to show [s]: the given one, or else the perch with margins, or the whole flight if it has no perch.
 
     Raises:
-        PerchError: nothing of the flight lies in it.
+        PerchError: the span does not overlap the flight.
     """
     perch, (first, last) = view.around(before, after), (float(view.truth.t[0]), float(view.truth.t[-1]))
     begin, finish = perch[0] if start is None else start, perch[1] if end is None else end
@@ -86,7 +86,7 @@ def span(view: FlightView, start: float | None, end: float | None, before: float
 
 
 def write_plots(view: FlightView, folder: Path, thrust: bool) -> None:
-    """The figures of the flight's report as PNG files; that of the thrust needs to know the vehicle."""
+    """Write the figures of the flight's report as PNG files; `thrust`: also that of the thrust, which requires the vehicle."""
     folder.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Callable[[FlightView], Figure | None]] = {
         "tracking": plots.tracking_figure, "path": plots.path_figure, "rates": plots.rates_figure,

@@ -22,12 +22,12 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 def stroboscope(view: FlightView, start: float, end: float, instants: int = 10) -> Figure:
-    """The figure.
+    """Draw the stroboscopic picture.
 
     Args:
-        view: what was recorded.
+        view: the flight.
         start, end: time span [s].
-        instants: how often the vehicle is drawn.
+        instants: number of instants at which the vehicle is drawn.
     """
     times = np.linspace(start, end, instants)
     flown = view.truth.at(np.linspace(start, end, 200))
@@ -57,7 +57,7 @@ def stroboscope(view: FlightView, start: float, end: float, instants: int = 10) 
 
 
 class Observer:
-    """Who sees the flight go to the right, from so far away that lines stay parallel.
+    """Viewpoint at infinity (parallel projection) from which the flight goes to the right.
 
     Attributes:
         towards: direction from the flight to the observer, shape (3,).
@@ -66,7 +66,7 @@ class Observer:
     def __init__(self, flight: np.ndarray) -> None:
         """
         Args:
-            flight: from its start to its end [m], shape (3,).
+            flight: vector from its start to its end [m], shape (3,).
         """
         a = math.atan2(flight[1], flight[0]) + AZIMUTH
         self.towards = np.array([math.cos(ELEVATION) * math.cos(a), math.cos(ELEVATION) * math.sin(a), math.sin(ELEVATION)])
@@ -75,7 +75,7 @@ class Observer:
         self._axes = np.column_stack([right, np.cross(self.towards, right)])
 
     def project(self, points: Any) -> np.ndarray:
-        """Points in W as they are in the picture [m], shape (..., 3) -> (..., 2)."""
+        """Project points in W into the picture [m], shape (..., 3) -> (..., 2)."""
         return np.asarray(points) @ self._axes
 
 
@@ -94,7 +94,7 @@ def draw_place(axes: Any, view: FlightView, observer: Observer) -> None:
 
 
 def draw_vehicle(axes: Any, vehicle: Vehicle, p: np.ndarray, R: np.ndarray, observer: Observer, color: Any, order: float) -> list[Any]:
-    """Arms, rotor discs, the ones behind first, and thrust axis; front rotors are red. Returns what was drawn."""
+    """Draw arms, rotor discs (farthest first) and thrust axis; front rotors are red. Return the drawn artists."""
     project = observer.project
     rotors = np.column_stack([vehicle.rotor_xy, np.zeros(len(vehicle.rotor_xy))])
     radius = 0.42 * float(np.min([np.linalg.norm(a - b) for i, a in enumerate(rotors) for b in rotors[:i]]))

@@ -1,1 +1,1 @@
-"""What perch_eval needs of ROS: message definitions, recorder and viewer, the recorded flight, the action client."""
+"""The parts of perch_eval that need ROS: message definitions, recorder, viewer, recorded flights, action client."""

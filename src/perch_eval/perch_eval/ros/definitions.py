@@ -1,4 +1,4 @@
-"""Message types by name, and their definitions as MCAP and Foxglove want them."""
+"""Message types by name, and their definitions in the form that MCAP and Foxglove require."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def schema_of(msg_type: type) -> Schema:
 
 
 def message_definition(name: str) -> str:
-    """Definition of a type followed by those of everything it contains, in MCAP's `ros2msg` form."""
+    """Return the definition of a type followed by those of the types it contains, in MCAP's `ros2msg` form."""
     seen: dict[str, str] = {}
 
     def collect(full: str) -> None:

@@ -1,4 +1,4 @@
-"""A visit to a running graph: a node in a ROS context of its own, whose callbacks run while its owner waits."""
+"""A temporary node in a running graph, with its own ROS context; its callbacks run only while its owner waits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ SLICE = 0.05  # of a wait, after which an interrupt counts [s]
 
 
 class GraphNode:
-    """A visitor. An interrupt ends its present wait, or what comes next: an exception out of a signal handler would end in rclpy's C++.
+    """A temporary node. An interrupt ends its present or next wait; it is not raised in the signal handler, as the exception
+    would then occur in rclpy's C++ code.
 
     Attributes:
         node: for publishers, subscriptions and clients.
@@ -30,7 +31,7 @@ class GraphNode:
         Args:
             name: of the node.
             arguments: ROS arguments.
-            interrupts: signals that are a KeyboardInterrupt of the main thread's wait.
+            interrupts: signals that raise KeyboardInterrupt in the wait; only if created in the main thread.
         """
         self._context = Context()
         join([], self._context)
@@ -45,45 +46,45 @@ class GraphNode:
         self._interrupted = True
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt where an interrupt has come."""
+        """Raise KeyboardInterrupt if an interrupt was received."""
         if self._interrupted:
             self._interrupted = False
             raise KeyboardInterrupt
 
     def spin(self, timeout: float) -> None:
-        """Run what has come, or comes in time [s].
+        """Execute callbacks that are due, or become due within the time-out [s].
 
         Raises:
-            KeyboardInterrupt: an interrupt has come.
+            KeyboardInterrupt: an interrupt was received.
         """
         self._executor.spin_once(timeout_sec=timeout)
         self.check()
 
     def spin_until(self, done: Callable[[], T], timeout: float = math.inf) -> T:
-        """Run what comes until `done` gives something true; returns what it gave last, which is not true where the timeout [s] came first."""
+        """Execute callbacks until `done` returns a true value or the time-out [s] expires; return the last value of `done`."""
         last = time.monotonic() + timeout
         while not (found := done()) and time.monotonic() <= last:
             self.spin(SLICE)
         return found
 
     def listen(self, duration: float) -> float:
-        """Run what comes for some wall-clock time; returns how long it really was [s]."""
+        """Execute callbacks for a wall-clock time; return its actual duration [s]."""
         begin = time.monotonic()
         while (left := begin + duration - time.monotonic()) > 0.0:
             self.spin(min(left, SLICE))
         return time.monotonic() - begin
 
     def nodes(self) -> set[str]:
-        """Fully qualified names of the nodes in the graph, as far as this one has been told."""
+        """Return the fully qualified names of the nodes discovered so far."""
         return {f"{namespace.rstrip('/')}/{name}" for name, namespace in self.node.get_node_names_and_namespaces()}
 
     def visible_nodes(self) -> set[str]:
-        """The same after a look at what has come."""
+        """Return the same after executing pending callbacks."""
         self.spin(0.02)
         return self.nodes()
 
     def close(self) -> None:
-        """Leave the graph. An interrupt that nobody has looked for counts now."""
+        """Leave the graph; raise KeyboardInterrupt for an interrupt that is still pending."""
         for number, handler in self._handlers.items():
             signal.signal(number, handler or signal.SIG_DFL)
         self._executor.shutdown()  # it holds the context, and so the middleware's threads, sockets and shared memory

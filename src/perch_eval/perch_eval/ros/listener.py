@@ -1,4 +1,4 @@
-"""Components that take messages as they are on the wire."""
+"""Components that receive serialised messages."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from perch_core.values import CameraImage, Serialized
 
 CAMERAS = ("down", "front")
 STAMPLESS = ("/tf", "/tf_static", "robot_description", "trajectory", "recovery")
-"""Channels whose messages have no header, or the stamp of a start that lies ahead: the newest stamp of the others counts."""
+"""Channels whose messages have no header, or a start time in the future as stamp: they get the newest stamp of the others."""
 
 C = TypeVar("C")
 T = TypeVar("T", bound=type[Component[Any]])
 
 
 class Wire(Input[Serialized]):
-    """All messages of a channel, for `on_message(channel, message)`."""
+    """Input of the serialised messages of a channel, handled by `on_message(channel, message)`."""
 
     def handler(self, component: Component[Any]) -> Callable[[Serialized], None]:
-        """Bound to the channel."""
+        """Return `on_message`, bound to the channel."""
         assert isinstance(component, Listener)
         return partial(component.on_message, self.channel(component))
 
 
 class Images(Input[CameraImage]):
-    """The images of a camera, for `on_image(camera, image)`."""
+    """Input of the images of a camera, handled by `on_image(camera, image)`."""
 
     def __init__(self, camera: str) -> None:
         super().__init__(CameraImage, f"camera_{camera}/image_raw", lazy=True)
         self.camera = camera
 
     def handler(self, component: Component[Any]) -> Callable[[CameraImage], None]:
-        """Bound to the camera."""
+        """Return `on_image`, bound to the camera."""
         assert isinstance(component, Listener)
         return partial(component.on_image, self.camera)
 
 
 class Listener(Component[C]):
-    """A component that takes messages by `on_message(channel, message)` and images by `on_image(camera, image)`.
+    """A component that handles messages by `on_message(channel, message)` and images by `on_image(camera, image)`.
 
     Attributes:
-        resolve: channel to the fully resolved name of its topic; set by a host with a namespace.
+        resolve: function from a channel to its fully resolved topic; set by a host with a namespace.
         newest: newest stamp so far [ns].
     """
 
@@ -54,15 +54,15 @@ class Listener(Component[C]):
         self.newest = 0
 
     def on_message(self, channel: str, message: Serialized) -> None:
-        """A message of a channel."""
+        """Handle a message of a channel."""
         raise NotImplementedError
 
     def on_image(self, camera: str, image: CameraImage) -> None:
-        """An image of a camera."""
+        """Handle an image of a camera."""
         raise NotImplementedError
 
     def serialized(self, channel: str, message: Any) -> Serialized:
-        """A message as it is on the wire, whether the host has it so or as a value; its stamp is when it was sent."""
+        """Return a message in serialised form, whichever form the host delivers; for `STAMPLESS`, with the newest stamp."""
         if not isinstance(message, Serialized):
             stamp = getattr(message, "stamp", 0)
             message = Serialized(self.resolve(channel), stamp, topics.encode(channel, message), topics.message_type(channel))
@@ -73,7 +73,7 @@ class Listener(Component[C]):
 
 
 def listening(channels: Iterable[str]) -> Callable[[T], T]:
-    """Gives a `Listener` a lazy port for each channel and camera."""
+    """Return a class decorator that gives a `Listener` a lazy port for each channel and camera."""
 
     def declare(cls: T) -> T:
         found: list[Wire | Images] = [*(Wire(Serialized, channel, lazy=True) for channel in channels), *map(Images, CAMERAS)]

@@ -24,7 +24,7 @@ from perch_eval.ros.graph_node import GraphNode
 from perch_sim.scenario import Scenario
 
 SERVICES = {"perching_planner": "plan_perch", "powerline_planner": "plan_powerline"}
-"""Services that a planner offers once it is compiled and warm, which may be long after its node is visible."""
+"""Services that a planner offers once it is compiled and warmed up, which may be long after its node is visible."""
 STALL = 60.0            # without progress or an answer of the mission [s]
 START_PATIENCE = 300.0  # [s] a node whose sources changed compiles first
 CANCEL_PATIENCE = 60.0  # simulation time that the mission has to end a cancelled goal: to leave a perch, or to descend [s]
@@ -38,11 +38,11 @@ class FlightResult:
     """How a goal ended.
 
     Attributes:
-        outcome: `perched` or the lower-case name of the error code.
-        message: the mission's words.
+        outcome: `perched`, `inspected`, `timeout`, or the lower-case name of the error code.
+        message: of the mission.
         end_time: simulation time at the end [s].
-        wall_time: wall-clock time from the goal, or from when simulation time began after it, to the end [s].
-        start_time: simulation time then [s]; None where the goal never was sent.
+        wall_time: wall-clock time to the end from the goal or, if later, from the start of simulation time [s].
+        start_time: simulation time at that start [s]; None if no goal was sent.
     """
 
     outcome: str
@@ -53,7 +53,7 @@ class FlightResult:
 
 
 class _Progress:
-    """Watches simulation time: since when it passes, and whether it stands still."""
+    """Monitors simulation time: when it started, and whether it advances."""
 
     def __init__(self, time_now: float) -> None:
         self.began = self._moved = time.monotonic()
@@ -61,7 +61,7 @@ class _Progress:
         self._explained = False
 
     def look(self, time_now: float) -> float:
-        """Wall-clock time for which simulation time has stood still [s]."""
+        """Return the wall-clock time for which simulation time has not advanced [s]."""
         now = time.monotonic()
         if time_now > self._last:
             if self._last == 0.0:  # it begins
@@ -70,7 +70,7 @@ class _Progress:
         return now - self._moved
 
     def explain(self) -> bool:
-        """Once whenever it stands still: whether that is to be explained now."""
+        """Return whether a stop of simulation time is to be reported now; true once per stop."""
         if self._explained or time.monotonic() - self._moved < NAMED:
             return False
         self._explained = True
@@ -78,12 +78,12 @@ class _Progress:
 
 
 class MissionClient(GraphNode):
-    """The mission's client. Time is that of `/clock`, in a namespace that of its `clock`.
+    """Client of the mission. Time is that of `/clock`, or of `clock` in the namespace if there is one.
 
     Attributes:
         time: newest simulation time seen [s].
-        waiting_for: who the vehicle waits for, with what it owes, as it says on `/diagnostics`; empty: for nobody.
-        processes: node -> where it runs, as its newest diagnostics say; another process after a restart.
+        waiting_for: participants that the vehicle waits for, and for which message, from `/diagnostics`; empty: none.
+        processes: node -> its process, from its newest diagnostics; changes when the node is restarted.
     """
 
     def __init__(self, namespace: str = "") -> None:
@@ -104,9 +104,9 @@ class MissionClient(GraphNode):
                                        topics.topic("/diagnostics").qos.subscribe)
 
     def news(self) -> list[str]:
-        """Which nodes, since the last call, have been started anew, or have fallen silent though others speak: they hang, or have ended.
+        """Return messages on nodes that, since the last call, were restarted or became silent while others publish (hung, ended).
 
-        Nodes of one process take turns: where one of them speaks, the others have but to wait.
+        Nodes of one process take turns: if one of them publishes, the others count as waiting, not silent.
         """
         now, (news, self._news) = time.monotonic(), (self._news, [])
         if now - max(self._heard.values(), default=0.0) < 0.5 * SILENT:
@@ -121,17 +121,17 @@ class MissionClient(GraphNode):
 
     def fly(self, scenario: Scenario, on_phase: Callable[[float, str, str], None] = lambda *_: None,
             check: Callable[[], None] = lambda: None, stall: float = STALL) -> FlightResult:
-        """Send the goal and wait for its end; when it has been under way for the scenario's time limit it is cancelled.
+        """Send the goal and wait for its end; it is cancelled when the scenario's time limit is exceeded.
 
         Args:
             scenario: what to fly.
-            on_phase: receives (simulation time [s], phase, message) when the phase or its message changes, when a node falls silent or
-                was restarted, and who is waited for when simulation time stands still.
-            check: called often; may raise to end the wait (a node that died).
+            on_phase: called with (simulation time [s], phase, message) when phase or message changes, when a node becomes silent
+                or was restarted, and, with the awaited participants, when simulation time stops.
+            check: called often; may raise to end the wait (for example after the end of a node).
             stall: wall-clock time without progress of simulation time after which the flight has failed [s].
 
         Raises:
-            PerchError: the mission does not answer, refuses the goal, is gone, or does not end a cancelled one; simulation time stands still.
+            PerchError: the mission does not answer, refuses the goal, ends, or does not end a cancelled one; or time stops.
         """
         seen = ("", "")
 
@@ -184,13 +184,13 @@ class MissionClient(GraphNode):
         return FlightResult(outcome, answer.message, answer.end_time or self.time, time.monotonic() - progress.began, progress.start)
 
     def depart(self, check: Callable[[], None]) -> tuple[bool, str]:
-        """Have a perched vehicle leave for a hover.
+        """Command a perched vehicle to depart to a hover.
 
         Args:
             check: called often; may raise to end the wait.
 
         Returns:
-            Whether it hovers, and the mission's words.
+            Whether it hovers, and the mission's message.
 
         Raises:
             PerchError: the mission does not answer.
@@ -205,7 +205,7 @@ class MissionClient(GraphNode):
             self.node.destroy_client(client)
 
     def linger(self, duration: float, check: Callable[[], None] = lambda: None, patience: float = 30.0) -> None:
-        """Let simulation time go on for a while, so that the recording shows the rest."""
+        """Wait until simulation time has advanced by `duration` [s], so that the recording covers what follows."""
         end = self.time + duration
 
         def over() -> bool:
@@ -220,12 +220,12 @@ class MissionClient(GraphNode):
         super().close()
 
     def _servers(self) -> set[bytes]:
-        """Who carries out goals."""
+        """Return the endpoint ids of the action servers."""
         topic = f"{self.node.resolve_service_name('perch')}/_action/status"
         return {bytes(info.endpoint_gid) for info in self.node.get_publishers_info_by_topic(topic)}
 
     def _look_around(self, servers: set[bytes], nodes: Collection[str]) -> None:
-        """A result comes from the process that took the goal, or never; a node of the scenario that is there must be heard from then on."""
+        """Raise PerchError if the action server that took the goal has ended; start monitoring the scenario's visible nodes."""
         if time.monotonic() - self._looked < LOOK:
             return
         self._looked = time.monotonic()

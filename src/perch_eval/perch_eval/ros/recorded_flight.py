@@ -1,4 +1,4 @@
-"""A flight from an MCAP file."""
+"""Flights read from, and written to, MCAP files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class RecordedFlight(Flight):
     def __init__(self, path: Path, namespace: str = "") -> None:
         """
         Args:
-            path: the file; one that is cut off is read as far as it goes.
+            path: the file; a truncated one is read as far as possible.
             namespace: of the vehicle, where several were recorded.
         """
         prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
@@ -35,7 +35,7 @@ class RecordedFlight(Flight):
         super().__init__({key: [] for key in self._undecoded}, str(path), damage[0] if damage else "")
 
     def values(self, channel: str) -> list[tuple[float, Any]]:
-        """As of any flight."""
+        """Return (time [s], value) of a channel in order; its messages are decoded at the first call."""
         if channel in self._undecoded:
             self._channels[channel] = list(_decoded(*self._undecoded[channel]))
             del self._undecoded[channel]
@@ -54,7 +54,7 @@ def _decoded(channel: str, messages: list[tuple[int, bytes]]) -> Iterator[tuple[
 
 @lru_cache(maxsize=None)
 def _channel(key: str, type_of: str) -> str | None:
-    """The channel of `perch_core.ros.topics` that a topic is, if it has one with this type."""
+    """Return the channel of `perch_core.ros.topics` for a topic, if there is one with this type."""
     for channel in (key, f"/{key}"):
         try:
             if type_name(topics.message_type(channel)) == type_of:
@@ -65,11 +65,11 @@ def _channel(key: str, type_of: str) -> str | None:
 
 
 def write(path: Path, values: Iterable[tuple[str, int, Any]], namespace: str = "") -> None:
-    """Write values as an MCAP file, as the recorder would have.
+    """Write values to an MCAP file, in the recorder's format.
 
     Args:
         path: the file.
-        values: (channel, time [ns], value) in the order in which they are to stand in the file.
+        values: (channel, time [ns], value) in the order of the file.
         namespace: of the vehicle.
     """
     with closing(McapLog(path)) as log:

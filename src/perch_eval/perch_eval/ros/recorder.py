@@ -33,9 +33,9 @@ class RecorderParameters:
 
 @listening(CHANNELS)
 class Recorder(Listener[RecorderParameters]):
-    """Keeps messages as they are on the wire with simulation time, and some of the images as JPEG.
+    """Records serialised messages with simulation time, and some of the images as JPEG.
 
-    A file that cannot be written ends the recording with one line of log, and never the flight.
+    A write error ends the recording, with one line of log, but not the flight.
     """
 
     config_type = RecorderParameters
@@ -57,11 +57,11 @@ class Recorder(Listener[RecorderParameters]):
             self._give_up(error)
 
     def on_message(self, channel: str, message: Serialized) -> None:
-        """Put a message on file."""
+        """Write a message to the file."""
         self._write(self.serialized(channel, message))
 
     def on_image(self, camera: str, image: CameraImage) -> None:
-        """Put one of some images on file. `image_rate` counts by stamps."""
+        """Write an image to the file, by stamps at most `image_rate` per second."""
         if self.config.image_rate == 0.0 or self._log is None:
             return
         last = self._last_image.get(camera)
@@ -73,7 +73,7 @@ class Recorder(Listener[RecorderParameters]):
             self._write(self.serialized(f"camera_{camera}/image_raw/compressed", packed))
 
     def on_flush(self, now: int) -> None:
-        """Hand to the operating system what is finished, and tell how it goes."""
+        """Flush finished chunks to the operating system, and publish diagnostics once per second."""
         if self._log is not None:
             try:
                 self._log.flush()
@@ -111,7 +111,7 @@ class Recorder(Listener[RecorderParameters]):
 
 
 def jpeg(image: CameraImage, quality: int) -> CompressedPixels | None:
-    """An image as JPEG; None where it has no pixels. `quality` [%]."""
+    """Encode an image as JPEG; None if it has no pixels. `quality` [%]."""
     pixels = image.pixels()
     if pixels is None:
         return None

@@ -1,4 +1,4 @@
-"""Component `viewer`: serves the running flight to Foxglove by WebSocket, with markers of what a person wants to see."""
+"""Component `viewer`: serves the running flight to Foxglove by WebSocket, with markers of the scene."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ RARE = (
     "robot_description")
 PASSING = ("/diagnostics", "/tf")  # of which the last message is nothing to who comes later
 KEPT = {"/tf_static": 100, "contact": 100}
-"""Messages kept for who comes later, where it is more than the last one."""
+"""Number of messages kept for late subscribers, where it is more than one."""
 MARKERS = "markers"
 RATE, SCENE_RATE, IMAGE_RATE = 50.0, 20.0, 10.0
-"""Messages of the 500 Hz topics, markers, and images of a camera while somebody looks, per second of simulation [Hz]."""
+"""Rates per second of simulation: messages of the 500 Hz topics, markers, and, while subscribed, images of a camera [Hz]."""
 IMAGE_QUALITY = 75  # of JPEG [%]
 SLOW_SCENE = 5  # what does not move is sent with every so many scenes: whoever comes late sees it too
 LOCAL = (
@@ -46,7 +46,7 @@ class ViewerParameters:
 
 
 class _Pace:
-    """Lets a message through every so often, by the stamps; also where they begin anew."""
+    """Rate limiter by stamps, which also handles stamps that restart."""
 
     def __init__(self, rate: float) -> None:
         self._period, self._next = round(NANOSECONDS / rate), -1
@@ -61,7 +61,7 @@ class _Pace:
 
 @listening((*FAST, *RARE, *PASSING))
 class Viewer(Listener[ViewerParameters]):
-    """Passes messages on as they are on the wire, and draws the scene."""
+    """Forwards serialised messages, and publishes the scene as markers."""
 
     config_type = ViewerParameters
 
@@ -92,11 +92,11 @@ class Viewer(Listener[ViewerParameters]):
         self.server = LiveServer(config.host, config.port, f"perch: {scenario.name}", config.origins)
 
     def warm_up(self) -> None:
-        """Tell where to look."""
+        """Log the address that is served."""
         self.info(f"ws://{self.config.host}:{self.server.port}")
 
     def on_message(self, channel: str, message: Serialized) -> None:
-        """Pass a message on, and take from it what the scene needs."""
+        """Forward a message, and use it for the scene if needed."""
         message = self.serialized(channel, message)
         pace = self._paces.get(channel)
         if pace is None or pace(message.stamp):
@@ -107,7 +107,7 @@ class Viewer(Listener[ViewerParameters]):
             self.warn(f"{channel} is not drawn: {error}", every=1.0)
 
     def on_image(self, camera: str, image: CameraImage) -> None:
-        """Pass an image on while somebody looks."""
+        """Forward an image as JPEG while its topic has subscribers."""
         channel = f"camera_{camera}/image_raw/compressed"
         topic = self.resolve(channel)
         self._declare(topic, topics.message_type(channel))
@@ -130,7 +130,7 @@ class Viewer(Listener[ViewerParameters]):
         self.server.send(message.topic, message.data, message.stamp, keep)
 
     def _see(self, channel: str, message: Serialized) -> None:
-        """Keep what the scene is made of; odometry draws it."""
+        """Keep the data of the scene; odometry triggers its drawing."""
         if channel == "odometry" and self._scene_pace(message.stamp):
             self._draw(topics.decode(channel, message.data))
         elif channel == "ground_truth/odometry":

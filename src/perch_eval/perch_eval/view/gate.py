@@ -1,9 +1,9 @@
-"""A door in front of a WebSocket server that accepts every web page: it lets in those whose origin is known.
+"""Proxy in front of a WebSocket server that accepts every web page: it admits only pages of allowed origins.
 
-Browsers let any page open a WebSocket to this machine and tell the server the page's origin; programs that are no browsers tell
-none. Foxglove's server does not look at it, so that any page a user visits could read the flight. It listens at a random address
-of the loopback network (127.0.0.0/8) and a random port, 39 bits that no page can guess in time, and this door at the address that
-people know.
+Browsers let any page open a WebSocket to this machine and send the page's origin to the server; other programs send none. As
+Foxglove's server does not check the origin, any page that a user visits could read the flight. The server therefore listens at a
+random address of the loopback network (127.0.0.0/8) and a random port, 39 bits that no page can guess in time, and this proxy at
+the public address.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n
 
 
 def unservable(host: str, port: int, error: OSError) -> ConfigError:
-    """Why an address cannot be served: it is in use, may not be used, or is none of this machine's."""
+    """Return the error for an address that cannot be served: in use, not permitted, or not one of this machine."""
     return ConfigError("viewer", "port", f"{host}:{port} cannot be served ({error.strerror}); choose another, as in --view 8766")
 
 
 def check_free(host: str, port: int) -> None:
-    """Make sure that a port can be served, before anything is started.
+    """Check that a port can be served, before anything is started.
 
     Raises:
-        ConfigError: it cannot.
+        ConfigError: it cannot be served.
     """
     try:
         socket.create_server((host, port)).close()
@@ -47,11 +47,11 @@ def hidden_host() -> str:
 
 
 def allowed(origin: str | None, origins: Iterable[str]) -> bool:
-    """Whether a page of an origin may look.
+    """Return whether a page of an origin may connect.
 
     Args:
-        origin: as in the handshake, `scheme://host[:port]`; None: no browser.
-        origins: those that may; without a port every port of the host, `*` everybody.
+        origin: as in the handshake, `scheme://host[:port]`; None: not a browser.
+        origins: allowed ones; without a port, every port of the host; `*`: all.
     """
     if origin is None:
         return True
@@ -77,14 +77,14 @@ def _port(origin: str) -> int | None:
 
 
 class Gate:
-    """Listens at an address and passes connections of allowed origins on."""
+    """Listens at an address and forwards connections of allowed origins."""
 
     def __init__(self, host: str, port: int, behind: tuple[str, int], origins: Iterable[str]) -> None:
         """
         Args:
             host, port: address that is served; port 0: any free one.
             behind: address of the server behind.
-            origins: who may look, see `allowed`.
+            origins: allowed ones, see `allowed`.
 
         Raises:
             OSError: the address cannot be served.
@@ -105,7 +105,7 @@ class Gate:
         return self._server.sockets[0].getsockname()[1]
 
     def close(self) -> None:
-        """Let nobody in any more, and end the connections that the server behind has not ended."""
+        """Stop accepting connections, and end those that the server behind has not ended."""
         asyncio.run_coroutine_threadsafe(self._end(), self._loop).result(timeout=5.0)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(timeout=5.0)
@@ -139,14 +139,14 @@ class Gate:
 
 
 def _origin(header: bytes) -> str | None:
-    """Origin in a handshake; of several none that is allowed."""
+    """Return the origin in a handshake; of several, `null`, which is never allowed."""
     found = [value.strip().decode("latin-1") for name, _, value in (line.partition(b":") for line in header.split(b"\r\n")[1:])
              if name.strip().lower() == b"origin"]
     return (found[0] if len(found) == 1 else "null") if found else None
 
 
 async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Bytes of one direction until its end, as fast as they are taken."""
+    """Forward the bytes of one direction until its end, as fast as they are accepted."""
     while data := await reader.read(CHUNK):
         writer.write(data)
         await writer.drain()

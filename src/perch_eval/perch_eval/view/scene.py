@@ -1,4 +1,4 @@
-"""What a person wants to see of a flight, as markers in `map`: vehicle, pad, cables, planned and flown path, waypoints."""
+"""Markers of a flight in `map`: vehicle, pad, cables, planned and flown path, waypoints."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def marker(shape: Shape, ns: str, id: int, colour: Colour, scale: Vector, p: Vec
 
 
 def polyline(ns: str, id: int, colour: Colour, width: float, points: Iterable[Vector], pieces: bool = False) -> Marker:
-    """A line through points in `map` [m], or (pieces) a line between each two of them; fewer than two points remove it."""
+    """Return a line through points in `map` [m], or (`pieces`) one per pair of points; fewer than two points delete it."""
     shape, corners = Shape.LINE_LIST if pieces else Shape.LINE_STRIP, tuple(_floats(p) for p in points)
     if len(corners) < 2:
         return removed(shape, ns, id)
@@ -46,7 +46,7 @@ def polyline(ns: str, id: int, colour: Colour, width: float, points: Iterable[Ve
 
 
 def removed(shape: Shape, ns: str, id: int) -> Marker:
-    """A marker that is drawn no longer."""
+    """Return the deletion of a marker."""
     return Marker(shape, ns, id, (0.0, 0.0, 0.0, 0.0), _ORIGIN, removed=True)
 
 
@@ -61,7 +61,7 @@ def label(ns: str, id: int, colour: Colour, height: float, p: Vector, text: str)
 
 
 def box_edges(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
-    """End points of the twelve edges of a box, for a line of pieces."""
+    """Return the end points of the twelve edges of a box, for a `polyline` with `pieces`."""
     corners = np.array(np.meshgrid(*zip(low, high), indexing="ij")).reshape(3, 8).T
     pairs = [(a, b) for a in range(8) for b in range(a) if np.count_nonzero(corners[a] != corners[b]) == 1]
     return [corners[k] for pair in pairs for k in pair]
@@ -74,7 +74,7 @@ class Path:
         self.points: list[tuple[float, ...]] = []
 
     def add(self, p: Sequence[float]) -> None:
-        """Take a position in, where it is far enough from the last one."""
+        """Add a position if it is far enough from the last one."""
         if self.points and max(abs(a - b) for a, b in zip(p, self.points[-1])) < PATH_STEP:
             return
         self.points.append(tuple(p))
@@ -83,7 +83,7 @@ class Path:
 
 
 def world_markers(scenario: Scenario) -> list[Marker]:
-    """What does not move: the room, the surface with its pad, the true cables, the waypoints."""
+    """Return the static markers: room, surface with pad, true cables, waypoints."""
     world = scenario.world
     half = np.array([world.room[0] / 2, world.room[1] / 2])
     low, high = (np.array([*(np.array(world.room_centre) + sign * half), z]) for sign, z in ((-1, 0.0), (1, world.room[2])))
@@ -105,7 +105,7 @@ def world_markers(scenario: Scenario) -> list[Marker]:
 
 
 def vehicle_markers(vehicle: Vehicle, state: OdometryState, words: str) -> list[Marker]:
-    """The vehicle where the estimator has it: rotors (the front ones red), thrust axis, camera axis, words above it."""
+    """Return the vehicle at its estimated pose: rotors (the front ones red), thrust axis, camera axis, text above it."""
     p, R = np.array(state.p_WB), so3.quat_to_matrix(np.array(state.q_WB))
     hubs = [p + R @ np.array([x, y, 0.0]) for x, y in vehicle.rotor_xy]
     out = [polyline("vehicle", 0, ESTIMATE, 0.02, [hubs[0], hubs[2], hubs[1], hubs[3]], pieces=True)]
@@ -122,7 +122,7 @@ def vehicle_markers(vehicle: Vehicle, state: OdometryState, words: str) -> list[
 
 
 def truth_markers(vehicle: Vehicle, state: OdometryState) -> list[Marker]:
-    """Where the vehicle really is: its ellipsoid."""
+    """Return the vehicle's ellipsoid at its true pose."""
     return [marker(Shape.SPHERE, "truth", 0, GHOST, 2 * np.array(vehicle.body_radii), state.p_WB, state.q_WB)]
 
 
@@ -133,7 +133,7 @@ def target_markers(p: np.ndarray, q: np.ndarray) -> list[Marker]:
 
 
 def map_markers(lines: PowerlineMap, before: Collection[int]) -> list[Marker]:
-    """The cables as mapped, with their ids; those in `before` that the map no longer has are removed."""
+    """Return the cables as mapped, with their ids; ids of `before` that are not in the map are deleted."""
     out = []
     for id in sorted(set(before) - {line.id for line in lines.lines}):
         out += [removed(Shape.LINE_STRIP, "map", 2 * id), removed(Shape.TEXT, "map", 2 * id + 1)]
@@ -145,7 +145,7 @@ def map_markers(lines: PowerlineMap, before: Collection[int]) -> list[Marker]:
 
 
 def plan_markers(trajectory: FlatTrajectory | SampledTrajectory, ends_in_contact: bool) -> list[Marker]:
-    """A trajectory that the controller was given; red at its end where it ends in a contact."""
+    """Return a trajectory given to the controller; its end point is red if it ends in a contact."""
     if isinstance(trajectory, FlatTrajectory):
         points = trajectory.sample_many(np.arange(0.0, trajectory.duration, PLAN_STEP)).p
     else:
@@ -155,5 +155,5 @@ def plan_markers(trajectory: FlatTrajectory | SampledTrajectory, ends_in_contact
 
 
 def path_markers(estimate: Path, truth: Path) -> list[Marker]:
-    """The flown path, as estimated and as it was."""
+    """Return the flown path, estimated and true."""
     return [polyline("flown", 0, ESTIMATE, 0.012, estimate.points), polyline("flown", 1, TRUTH, 0.008, truth.points)]

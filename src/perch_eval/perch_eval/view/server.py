@@ -19,11 +19,11 @@ class LiveServer(foxglove.websocket.ServerListener):
         """
         Args:
             host, port: address that is served; port 0: any free one.
-            name: shown to who looks.
+            name: shown to clients.
             origins: of web pages that may look, see `perch_eval.view.gate.allowed`.
 
         Raises:
-            ConfigError: the port is taken, or the address is none of this machine's.
+            ConfigError: the port is in use, or the address is not one of this machine.
         """
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
@@ -52,25 +52,25 @@ class LiveServer(foxglove.websocket.ServerListener):
         self._channels[topic] = foxglove.Channel(topic, message_encoding="cdr", schema=described, context=self._context)
 
     def watched(self, topic: str) -> bool:
-        """Somebody looks at the topic."""
+        """Return whether the topic has subscribers."""
         return self._channels[topic].has_sinks()
 
     def send(self, topic: str, data: bytes, time: int, keep: int = 0) -> None:
-        """Send one serialised message; `time` is simulation time [ns]. The last `keep` ones are sent again to who subscribes later."""
+        """Send one serialised message; `time` is simulation time [ns]. The last `keep` ones are resent on later subscriptions."""
         if keep:
             self._kept.setdefault(topic, deque(maxlen=keep)).append((data, time))
         self._channels[topic].log(data, log_time=time)
 
     def on_subscribe(self, client: foxglove.websocket.Client, channel: foxglove.websocket.ChannelView) -> None:
-        """Somebody begins to look; called by the server's thread."""
+        """Resend the kept messages of a newly subscribed topic; called by the server's thread."""
         for data, time in tuple(self._kept.get(channel.topic, ())):
             self._channels[channel.topic].log(data, log_time=time)
 
     def tell_time(self, time: int) -> None:
-        """Tell simulation time [ns]."""
+        """Broadcast simulation time [ns]."""
         self._server.broadcast_time(time)
 
     def close(self) -> None:
-        """Say goodbye to everybody who looks."""
+        """Stop serving and close all connections."""
         self._server.stop()
         self._gate.close()

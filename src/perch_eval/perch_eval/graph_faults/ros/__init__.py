@@ -1,1 +1,1 @@
-"""What the campaign of faults sees of the graph."""
+"""Observation of the graph by the campaign of faults."""

@@ -1,4 +1,4 @@
-"""What the campaign sees of a flight: the truth, the rotors, contacts, and what the controller says."""
+"""Observation of a flight by the campaign: true state, rotor speeds, contacts and the controller's status."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ CHANNELS = ("ground_truth/odometry", "rotor_state", "contact", "controller/statu
 
 
 class Watcher:
-    """Subscribes with a pilot's node; only the newest message of each channel is looked at, and only when it is asked for.
+    """Subscribes with the pilot's node; only the newest message of each channel is decoded, and only on demand.
 
     Attributes:
-        contacts: all of them, in order.
+        contacts: all contacts, in order.
     """
 
     def __init__(self, pilot: MissionClient) -> None:
@@ -45,7 +45,7 @@ class Watcher:
             self._start = topics.decode(channel, message).p_WB
 
     def disturb(self, fault: str) -> None:
-        """Have the relay do something to what it passes on."""
+        """Set the disturbance of the relay."""
         self._fault.publish(String(data=fault))
 
     def _value(self, channel: str) -> Any:
@@ -54,24 +54,24 @@ class Watcher:
 
     @property
     def position(self) -> tuple[float, ...] | None:
-        """True position of the centre of mass in W [m]; None: nothing has come yet."""
+        """True position of the centre of mass in W [m]; None: not received yet."""
         state = self._value("ground_truth/odometry")
         return None if state is None else state.p_WB
 
     @property
     def height(self) -> float:
-        """Above where the vehicle stood before the flight [m]."""
+        """Height above the vehicle's place before the flight [m]."""
         p = self.position
         return 0.0 if p is None or self._start is None else p[2] - self._start[2]
 
     @property
     def time(self) -> float:
-        """Stamp of the newest true state [s]; 0: nothing has come yet."""
+        """Stamp of the newest true state [s]; 0: not received yet."""
         state = self._value("ground_truth/odometry")
         return 0.0 if state is None else seconds(state.stamp)
 
     def situation(self) -> Situation | None:
-        """As it is now; None: not all has come yet."""
+        """Return the present situation; None: true state or rotor speeds not received yet."""
         state, rotors, status = map(self._value, ("ground_truth/odometry", "rotor_state", "controller/status"))
         if state is None or rotors is None:
             return None

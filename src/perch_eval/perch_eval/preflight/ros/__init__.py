@@ -1,1 +1,1 @@
-"""What listens to the graph."""
+"""ROS side of the preflight check."""

@@ -1,4 +1,4 @@
-"""Listens to a vehicle's graph for preflight, and gives the controller orders where it is allowed to."""
+"""Subscriptions of preflight to a vehicle's graph, and commands to the controller where they are allowed."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ SETTLING = 0.3      # after an effect, until the commands are looked at [s]
 
 
 class GraphListener(GraphNode):
-    """Subscribes to everything that is judged.
+    """Subscribes to all channels that are checked.
 
     Attributes:
-        values: channel -> (arrival by the wall clock [s], value), the newest `KEPT`.
-        turns: of the camera that is watched.
+        values: channel -> (arrival by the monotonic clock [s], value), the newest `KEPT`.
+        turns: rotation of the watched camera; None: no camera is watched.
     """
 
     def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
@@ -62,24 +62,24 @@ class GraphListener(GraphNode):
         self.turns.add(image.stamp, image.pixels())
 
     def await_first(self, channel: str, patience: float) -> None:
-        """Until a channel's first value has come, or for so long [s]: nodes find each other in their own time."""
+        """Wait for the first value of a channel, as discovery takes time; at most for `patience` [s]."""
         self.spin_until(lambda: self.values[channel], patience)
 
     def watch(self, camera: str, model: Camera) -> None:
-        """Look through a camera from now on."""
+        """Subscribe to the images of a camera to measure its rotation."""
         self.turns, row = CameraTurns(model), topics.topic(f"camera_{camera}/image_raw")
         self.node.create_subscription(row.message, f"camera_{camera}/image_raw", partial(self._look, row), row.qos.subscribe, raw=True)
 
     def stamped(self, channel: str) -> list[tuple[float, int]]:
-        """Arrival [s] and stamp [ns] of everything on a channel."""
+        """Return (arrival [s], stamp [ns]) of the values of a channel."""
         return [(arrival, value.stamp) for arrival, value in self.values[channel]]
 
     def newest(self, channel: str) -> Any:
-        """The newest value of a channel; None: there is none."""
+        """Return the newest value of a channel; None: there is none."""
         return self.values[channel][-1][1] if self.values[channel] else None
 
     def order(self, command: int, state: int) -> Order:
-        """Give the controller an order, and wait for a state."""
+        """Send the controller a command and wait until it reports a state, or for a time-out."""
         stamp = getattr(self.newest("odometry"), "stamp", 0)
         row, begun = topics.topic("controller/command"), time.monotonic()
         self._orders.publish(row.to_message(ControllerCommand(stamp, command, "preflight, props off")))
@@ -91,7 +91,7 @@ class GraphListener(GraphNode):
         return Order(self.newest("controller/status"), delay, sent[-1].armed if sent else None)
 
     def await_end_of_commands(self, patience: float) -> tuple[float | None, float | None]:
-        """When the last command came, and when a motor last turned after that [s]; see `checks.stopped`."""
+        """Wait for the last command; return its time, and that of the last turning of a motor [s]; see `checks.stopped`."""
         end = time.monotonic() + patience
         while time.monotonic() < end:
             self.listen(0.1)
@@ -102,7 +102,7 @@ class GraphListener(GraphNode):
         return None, None
 
     def await_takeover(self, patience: float) -> tuple[bool, bool | None]:
-        """Whether the motors turned, and whether commands went on, armed, when they stopped; see `checks.taken_over`."""
+        """Return whether the motors turned, and whether armed commands continued when they stopped; see `checks.taken_over`."""
         begun, turned = time.monotonic(), False
         while time.monotonic() < begun + patience:
             self.listen(0.1)
@@ -114,7 +114,7 @@ class GraphListener(GraphNode):
         return turned, None
 
     def _motion(self, since: float) -> list[list[tuple[float, bool]]]:
-        """What each source has told since a time [s] of the motors: when, and whether they turn; without sources that are silent."""
+        """Return (arrival [s], whether the motors turn) of each source since a time [s]; sources without values are left out."""
         rotors: list[tuple[float, RotorState]] = [entry for entry in self.values["rotor_state"] if entry[0] > since]
         turning = [(arrival, max(state.speed) > TURNING * self._fastest) for arrival, state in rotors]
         armed = [(arrival, str(said.values["armed"]).lower() == "true") for arrival, said in self.values["/diagnostics"]
