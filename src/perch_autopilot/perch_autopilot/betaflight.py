@@ -1,4 +1,4 @@
-"""Component of the node `betaflight`: body rates and thrust to a flight controller over MSP; its IMU and its state back."""
+"""Component of the node `betaflight`: sends body rates and thrust to a flight controller over MSP, reads its IMU and state."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class BetaflightParameters:
 class Betaflight(Component[BetaflightParameters]):
     """Commands a flight controller that runs Betaflight.
 
-    Whether its motors turn is decided by the switch that it gets, by the firmware's own checks, and by the pilot, whose switch for the mode
-    MSP OVERRIDE takes the sticks back at any time.
+    Whether its motors turn depends on the commanded arming switch, on the firmware's own checks, and on the pilot, who can take
+    control back at any time by the switch of the mode MSP OVERRIDE.
     """
 
     config_type = BetaflightParameters
@@ -51,8 +51,8 @@ class Betaflight(Component[BetaflightParameters]):
         Raises:
             ConfigError: there is no such vehicle or configuration, or the vehicle takes other commands.
             LinkError: the link cannot be opened.
-            MspError: nobody answers, another firmware than this was written for, or one that is not armed and will not fly: it refuses to
-                arm for a lasting reason, or the vehicle has no thrust curve for the battery.
+            MspError: no autopilot answers, or its firmware is not supported; or, unless it is armed already, it refuses to arm
+                for a lasting reason, or the vehicle's thrust curve does not cover the battery's voltage.
         """
         super().__init__(config)
         vehicle, loaded = commanded_vehicle(config.vehicle), load_configuration(config.configuration)
@@ -77,11 +77,11 @@ class Betaflight(Component[BetaflightParameters]):
         return SupervisedLink(self.config.link, *self._throttles(), self.config.disarm_after, self._sticks.curves[:2])
 
     def _throttles(self) -> tuple[int, int]:
-        """Throttles of hover and descent [us]."""
+        """Return the throttles of hover and descent [us]."""
         return self._sticks.throttle_for(1.0), self._sticks.throttle_for(DESCENT)
 
     def _identify(self) -> msp.Version:
-        """Ask for the firmware's version, and whether it can fly."""
+        """Request the firmware's version, and check that it can fly."""
         wanted = (msp.FC_VARIANT, msp.FC_VERSION, msp.STATUS, msp.ANALOG)
         answers: dict[int, msp.Frame] = {}
         last, said = time.monotonic() + _HANDSHAKE, [""]
@@ -108,7 +108,7 @@ class Betaflight(Component[BetaflightParameters]):
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
-        """On to the autopilot, until the next, or until it is stale."""
+        """Send a command to the autopilot; it is in effect until the next one, or until it is stale."""
         values = (*command.w_B, command.thrust)
         if not sum(value * value for value in values) < 1e8:
             self.warn(f"rates_thrust_command: {values} is not finite, or beyond any vehicle: ignored", every=1.0)
@@ -121,7 +121,7 @@ class Betaflight(Component[BetaflightParameters]):
     # -- from it -----------------------------------------------------------------------------------------------------
 
     def on_poll(self, now: int) -> None:
-        """Take what has come, the newest of each kind; ask for the next sample, and for the rest in turn."""
+        """Process the newest answer of each kind; request the next IMU sample, and the other data in turn."""
         if self._now is None or (jump := jumped(self._now, now)):
             self._answered, self._diagnosed, self._wanted_since = now, now - NANOSECONDS, None
             if self._now is not None:
@@ -147,7 +147,7 @@ class Betaflight(Component[BetaflightParameters]):
             self._diagnose(now)
 
     def _reopen(self, now: int, ended: LinkError) -> None:
-        """Start another process that holds the link: what flies follows the next command, and descends without one; on the ground it idles."""
+        """Restart the link's process: in flight, the vehicle follows the next command or descends; on the ground, it idles."""
         if 0 <= now - self._opened < REOPEN * NANOSECONDS:
             return
         self._opened = now
@@ -192,7 +192,7 @@ class Betaflight(Component[BetaflightParameters]):
                                    f"{low:g} to {high:g} V")
 
     def _judge_arming(self, status: msp.Status, now: int) -> None:
-        """Say why it does not arm; it names no reason where another one than we has the switch."""
+        """Report why the autopilot does not arm; it gives no reason if it does not use the arming switch of this node."""
         if not self._wanted or status.armed:
             self._wanted_since = None
         elif self._wanted_since is None:
@@ -219,5 +219,5 @@ class Betaflight(Component[BetaflightParameters]):
         self.diagnostics(Diagnostics(now, values, 2 if silent else 0, "the autopilot is silent" if silent else "ok"))
 
     def close(self) -> None:
-        """Commands end: what flies descends, by the watchdog's times."""
+        """Stop commanding: a vehicle in flight descends after the watchdog's times."""
         self._link.close()

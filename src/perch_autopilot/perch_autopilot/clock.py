@@ -1,4 +1,4 @@
-"""A host's clock that jumps, seen by who is woken at a short period."""
+"""Detection of jumps of the host's clock by a component that is woken at a short period."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ JUMP = NANOSECONDS  # time does not go on by more between two wakes of a node th
 
 
 def jumped(before: int | None, now: int) -> str:
-    """What is wrong with a host's time [ns] after another; empty: nothing, or there was none before."""
+    """Describe a jump of the host's clock between the times of two wakes [ns]; empty if there is none, or no earlier wake."""
     if before is None or 0 <= now - before < JUMP:
         return ""
     way, else_ = ("back", "") if now < before else ("on", ", or this node has stood still")

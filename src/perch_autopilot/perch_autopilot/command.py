@@ -1,4 +1,4 @@
-"""Commands for Betaflight: build its firmware as a program, say where it is, configure an autopilot."""
+"""Commands for Betaflight: build its firmware as a program and print its path, configure or check an autopilot."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EXAMPLES = """examples:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     out = argparse.ArgumentParser(prog="betaflight.py", description=__doc__, epilog=EXAMPLES,
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = out.add_subparsers(dest="verb", required=True)
@@ -31,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point; 0 done, 2 it cannot be done, 130 interrupted."""
+    """Entry point; returns 0 for success, 2 for an error, 130 if interrupted."""
     args = parser().parse_args(arguments)
     try:
         if args.verb == "build":

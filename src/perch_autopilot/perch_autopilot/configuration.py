@@ -1,4 +1,4 @@
-"""The autopilot's configuration: a file of lines as Betaflight's CLI takes them, sent to it, and checked by reading it back."""
+"""Configuration of the autopilot: a file of lines for Betaflight's CLI, sent to the autopilot and checked by reading it back."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _ANSWER_TIME = 20.0  # for one line, on a busy machine [s]
 
 
 class CliError(PerchError):
-    """The firmware's command line does not answer, or does not take a line."""
+    """Raised when the firmware's CLI does not answer or refuses a line, and when the settings differ from the configuration."""
 
 
 @dataclass(frozen=True)
 class Configuration:
-    """What the firmware shall be set to.
+    """Settings that the firmware is to have.
 
     Attributes:
         source: file, for messages.
-        lines: as the CLI takes them, without comments.
+        lines: lines for the CLI, without comments.
     """
 
     source: str
@@ -34,20 +34,20 @@ class Configuration:
 
     @property
     def settings(self) -> dict[str, str]:
-        """Name -> value of the lines `set name = value`."""
+        """Mapping from name to value of the lines `set name = value`."""
         return _settings(self.lines)
 
     @property
     def identity(self) -> str:
-        """Changes with every line."""
+        """Hash of the lines."""
         return hashlib.sha256("\n".join(self.lines).encode()).hexdigest()[:16]
 
 
 def load_configuration(name: str) -> Configuration:
-    """The configuration of `config/autopilot/<name>.txt`, or of a file.
+    """Return the configuration of `config/autopilot/<name>.txt`, or of a file.
 
     Raises:
-        ConfigError: no such file, or a line that is none of `set`, `feature`, `aux`, `map`, `serial`, `mixer`.
+        ConfigError: no such file, no line in it, or a line that is none of `set`, `feature`, `aux`, `map`, `serial`, `mixer`.
     """
     file = Path(name) if Path(name).suffix else config.config_dir() / "autopilot" / f"{name}.txt"
     try:
@@ -69,20 +69,20 @@ class Cli:
     def __init__(self, send: Callable[[bytes], None], receive: Callable[[float], bytes]) -> None:
         """
         Args:
-            send: bytes to the firmware.
-            receive: what has come within a time [s]; empty: nothing.
+            send: sends bytes to the firmware.
+            receive: returns the bytes that arrive within a time [s]; empty if there are none.
 
         Raises:
-            CliError: it does not answer.
+            CliError: the firmware does not answer.
         """
         self._send, self._receive, self._saved = send, receive, False
         self.ask("#", end="")
 
     def ask(self, line: str, end: str = "\r\n") -> str:
-        """The answer to a line.
+        """Send a line and return the answer.
 
         Raises:
-            CliError: there is none.
+            CliError: there is no answer.
         """
         self._send((line + end).encode())
         text, last = b"", time.monotonic() + _ANSWER_TIME
@@ -94,7 +94,7 @@ class Cli:
         return text.decode("ascii", "replace")
 
     def apply(self, configuration: Configuration) -> None:
-        """Send every line, then have it saved, which restarts the firmware.
+        """Send every line, then save, which restarts the firmware.
 
         Raises:
             CliError: a line is refused.
@@ -108,15 +108,15 @@ class Cli:
         self._saved = True
 
     def leave(self) -> None:
-        """End the command line, in which the firmware neither answers nor arms: it restarts. What is not saved is forgotten."""
+        """Leave the CLI, in which the firmware neither answers MSP nor arms: it restarts. Unsaved settings are lost."""
         if not self._saved:
             self._send(b"exit\r\n")
 
     def check(self, configuration: Configuration) -> None:
-        """Read everything back.
+        """Compare the autopilot's settings with a configuration.
 
         Raises:
-            CliError: something is set otherwise.
+            CliError: a setting differs.
         """
         found = dump_lines(self.ask("dump"))
         wrong = differences(configuration.lines, found)
@@ -126,7 +126,7 @@ class Cli:
 
 
 def dump_lines(answer: str) -> list[str]:
-    """The lines of a `dump`."""
+    """Return the lines of a `dump`."""
     return [" ".join(line.split()) for line in answer.splitlines() if line.strip() and not line.startswith("#")]
 
 
@@ -135,7 +135,7 @@ def _settings(lines: Sequence[str]) -> dict[str, str]:
 
 
 def differences(wanted: Sequence[str], found: Sequence[str]) -> list[str]:
-    """What a dump has otherwise than it was wanted, each in words."""
+    """Describe the differences between the wanted lines and those of a dump."""
     settings = _settings(found)
     lines, wrong = set(found), []
     for line in wanted:

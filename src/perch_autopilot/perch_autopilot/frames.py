@@ -1,4 +1,4 @@
-"""Between the axes of ROS and those of aviation, in one place.
+"""Conversion between the axes of ROS and those of aviation.
 
     world: ENU (x east, y north, z up)       <->  NED (x north, y east, z down)
     body:  FLU (x forward, y left, z up)     <->  FRD (x forward, y right, z down)
@@ -22,23 +22,23 @@ BODY = np.diag([1.0, -1.0, -1.0])
 
 
 def world(v: Numbers) -> np.ndarray:
-    """A vector of the world, ENU <-> NED; any unit."""
+    """Convert a vector of the world, ENU <-> NED; any unit."""
     return WORLD @ v
 
 
 def body(v: Numbers) -> np.ndarray:
-    """A vector of the body, FLU <-> FRD; any unit."""
+    """Convert a vector of the body, FLU <-> FRD; any unit."""
     return BODY @ v
 
 
 def covariance(P: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Covariance of two vectors, shape (6, 6), both in the axes that are changed by `WORLD` or `BODY`."""
+    """Convert the covariance of two vectors, shape (6, 6), by the change of axes `WORLD` or `BODY`."""
     both = np.kron(np.eye(2), axes)
     return both @ P @ both.T
 
 
 def attitude(q: np.ndarray) -> np.ndarray:
-    """Attitude of the body in the world: of FLU in ENU <-> of FRD in NED.
+    """Convert the attitude of the body in the world: of FLU in ENU <-> of FRD in NED.
 
         q' = q_NE q q_FB,   q_NE = (1, 1, 0, 0) / sqrt 2,  q_FB = (1, 0, 0, 0),   xyzw; the sign is that with w >= 0
     """

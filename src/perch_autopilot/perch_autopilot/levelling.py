@@ -1,8 +1,8 @@
-"""Levelling by body rates where a body is tilted far: the rate is about the horizontal axis that turns its z axis up the shortest way.
+"""Levelling by body rates at large tilt: rotation about the horizontal axis that turns the body's z axis up by the shortest way.
 
-Betaflight's self-level steers roll and pitch by Euler angles, which is no shortest way beyond about 60 deg of tilt. This law is the
-proportional control of the reduced attitude (Bullo, Murray, Sarti, 1995): the direction up in B, which the firmware's Euler angles give
-without a singularity.
+Betaflight's self-level mode controls roll and pitch as Euler angles, which is not the shortest rotation beyond about 60 deg of
+tilt. This law is proportional control of the reduced attitude (Bullo, Murray, Sarti, 1995): the direction up in B, which follows
+from the firmware's Euler angles without a singularity.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ FRESH = 0.05  # an attitude that is older does not count [s]
 
 
 def up(roll: float, pitch: float) -> tuple[float, float, float]:
-    """Unit vector up in B (FLU) at roll and pitch of FRD against NED [rad]."""
+    """Return the unit vector up in B (FLU), for roll and pitch of FRD against NED [rad]."""
     return sin(pitch), sin(roll) * cos(pitch), cos(roll) * cos(pitch)
 
 
 def tilt(up_B: tuple[float, float, float]) -> float:
-    """Angle between the body's z axis and up [rad]."""
+    """Return the angle between the body's z axis and up [rad]."""
     return atan2(hypot(up_B[0], up_B[1]), up_B[2])
 
 
 def rates(up_B: tuple[float, float, float], most: float) -> tuple[float, float]:
-    """Body rates about x and y in B (FLU) [rad/s], together at most `most`, that turn z to up; about x where it points straight down."""
+    """Return the rates about x and y in B (FLU) [rad/s], of norm up to `most`, that turn z up; about x if z points down."""
     x, y, _ = up_B
     sine, rate = hypot(x, y), min(GAIN * tilt(up_B), most)
     return (rate, 0.0) if sine < 1e-6 else (-rate * y / sine, rate * x / sine)
 
 
 def sticks(up_B: tuple[float, float, float], curves: Sequence[RateCurve]) -> tuple[int, int]:
-    """Pulse widths of roll and pitch [us] for `rates`."""
+    """Return the pulse widths of roll and pitch [us] for `rates`."""
     both = rates(up_B, radians(min(curve.most for curve in curves)))
     roll, pitch = (round(CENTRE + HALF * curve.stick(degrees(rate))) for curve, rate in zip(curves, both))
     return roll, pitch

@@ -1,4 +1,4 @@
-"""The link to an autopilot: a serial port, or TCP. One process has it at a time."""
+"""Link to an autopilot: a serial port or TCP, held by one process at a time."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _TAKEN = "another process has this port: another node, or what a node has left b
 
 
 class LinkError(PerchError):
-    """The link cannot be opened, or it has ended."""
+    """Raised when the link cannot be opened, or has ended."""
 
 
 class Link:
-    """Bytes to and from an autopilot."""
+    """Stream of bytes to and from an autopilot."""
 
     def __init__(self, address: str) -> None:
         """
         Args:
-            address: `/dev/ttyACM0`, `/dev/ttyACM0@921600` (115200 baud without a rate), `tcp:HOST:PORT`, or `fd:NUMBER`, a file that
-                this process has.
+            address: `/dev/ttyACM0`, `/dev/ttyACM0@921600` (115200 baud without a rate), `tcp:HOST:PORT`, or `fd:NUMBER`, a file
+                that this process has open.
 
         Raises:
-            LinkError: it cannot be opened.
+            LinkError: the link cannot be opened.
         """
         self._rest = b""  # of a frame that the port has accepted in part
         self._sockets: tuple[socket.socket, ...] = ()
@@ -52,7 +52,7 @@ class Link:
         """Send a frame, whole or not at all: while the port is full it is dropped, because a late command would be worse.
 
         Raises:
-            LinkError: it has ended.
+            LinkError: the link has ended.
         """
         try:
             if self._rest:
@@ -65,10 +65,10 @@ class Link:
             raise LinkError(f"the link to the autopilot has ended: {error.strerror}") from None
 
     def read(self, timeout: float = 0.0) -> bytes:
-        """What has come within a time [s]; empty: nothing.
+        """Return the bytes that arrive within a time [s]; empty if there are none.
 
         Raises:
-            LinkError: it has ended.
+            LinkError: the link has ended.
         """
         if not select.select([self.file], [], [], timeout)[0]:
             return b""
@@ -83,7 +83,7 @@ class Link:
         return data
 
     def close(self) -> None:
-        """Close it."""
+        """Close the link."""
         for one in self._sockets:
             one.close()
         if not self._sockets:
@@ -91,10 +91,10 @@ class Link:
 
 
 def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socket.socket]:
-    """The connection, and the lock of its address: a name that one process of this machine can have, until it closes it.
+    """Return the connection, and the lock of its address: an abstract socket name, which one process of this machine can hold.
 
     Raises:
-        OSError, OverflowError, LinkError: there is none.
+        OSError, OverflowError, LinkError: the connection is refused, or another process holds the lock.
     """
     lock = socket.socket(socket.AF_UNIX)
     try:
@@ -112,10 +112,10 @@ def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socke
 
 
 def _opened_port(address: str) -> int:
-    """File number of a serial port, which is locked and set up.
+    """Open, lock and configure a serial port; return its file number.
 
     Raises:
-        OSError, LinkError: it cannot be opened.
+        OSError, LinkError: the port cannot be opened, or another process holds it.
     """
     device, _, baud = address.partition("@")
     file = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)

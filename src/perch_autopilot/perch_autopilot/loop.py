@@ -1,4 +1,4 @@
-"""The simulated vehicle's inner loop by Betaflight's firmware: body rates and thrust in, what the motors aim at out."""
+"""Inner loop of the simulated vehicle by Betaflight's firmware: body rates and thrust in, target speeds of the motors out."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _STILL = (0.0, 0.0, 0.0)
 
 
 class Reading(Protocol):
-    """Of an IMU: specific force [m/s^2] and angular velocity [rad/s] in B, (3,) each."""
+    """Sample of an IMU: specific force [m/s^2] and angular velocity [rad/s] in B, (3,) each."""
 
     accel: np.ndarray
     gyro: np.ndarray
 
 
 class FirmwareLoop:
-    """Flies the simulated vehicle as its autopilot: it sees what the IMU reads, and moves sticks and switches.
+    """Runs the firmware as the autopilot of the simulated vehicle, with the samples of its IMU, and stick and switch positions.
 
-    What it is told when commands stop is the watchdog's, as on a vehicle. Before the flight it arms once on a bench.
+    When commands stop, the watchdog replaces them, as on a vehicle. The constructor arms and disarms the firmware once, at rest.
 
     Attributes:
         sitl: the firmware.
-        watchdog: what comes of commands that stop.
-        watches: commands that stop are its own business.
+        watchdog: replaces commands that stop.
+        watches: the loop itself handles commands that stop, instead of the motors' time-out.
     """
 
     watches = True
@@ -43,11 +43,11 @@ class FirmwareLoop:
     def __init__(self, vehicle: Vehicle, voltage_factor: float = 1.0) -> None:
         """
         Args:
-            vehicle: whose rotors it drives; `actuation.firmware` names the configuration.
-            voltage_factor: of the battery / that of the vehicle's thrust curve; motors turn in proportion to it.
+            vehicle: vehicle whose rotors are driven; `actuation.firmware` names the configuration.
+            voltage_factor: battery voltage / that of the vehicle's thrust curve; rotor speeds are proportional to it.
 
         Raises:
-            FirmwareError: the firmware is not there, or does not arm.
+            FirmwareError: the firmware is not installed, or does not arm.
             NamespaceError, CliError, ConfigError: see `Sitl`, `load_configuration`.
         """
         loaded = load_configuration(vehicle.actuation.firmware)
@@ -70,7 +70,7 @@ class FirmwareLoop:
             raise
 
     def _bench(self, switch: int, what: str) -> None:
-        """Motors turn with the arming switch, and stand without it."""
+        """Run the firmware at rest until its motors turn (switch on) or stand still (switch off)."""
         for _ in range(_LAST):
             motors = self.sitl.step(_STILL, GRAVITY, LEVEL, (*CENTRED, switch))
             if min(motors) > 0.5 * self._idle if switch == ON else max(motors) == 0.0:
@@ -79,16 +79,16 @@ class FirmwareLoop:
         raise FirmwareError(f"Betaflight's firmware does not {what}: {reasons}")
 
     def command(self, now: int, armed: bool, rates: Sequence[float], thrust: float) -> None:
-        """Take a command at a time [ns]: body rates in B [rad/s], collective thrust / mass [m/s^2]."""
+        """Accept a command at a time [ns]: body rates in B [rad/s], collective thrust / mass [m/s^2]."""
         self.watchdog.command(now / NANOSECONDS, armed, self.sticks.channels(rates, thrust))
 
     def speeds(self, now: int, x: np.ndarray, speeds: np.ndarray, sample: Reading) -> np.ndarray:
-        """Rotor speeds that the motors aim at in the period that begins now [ns], shape (4,) [rad/s]; zero where they stand.
+        """Return the target speeds of the rotors for the period that begins now [ns], shape (4,) [rad/s]; zero if they stand.
 
         Args:
-            now, x, speeds: as in `perch_sim.inner_loop`; of the state only the orientation goes to the firmware, whose rate loop does not
-                look at it.
-            sample: what the IMU has read last.
+            now, x, speeds: as in `perch_sim.inner_loop`; of the state, only the orientation is sent to the firmware; its rate
+                loop does not use it.
+            sample: last sample of the IMU.
         """
         motors = np.asarray(self.sitl.step(sample.gyro, sample.accel, (x[6], x[3], x[4], x[5]), self.channels(now / NANOSECONDS)))
         turn = motors > 0.5 * self._idle
@@ -97,7 +97,7 @@ class FirmwareLoop:
         return np.where(turn, self._voltage_factor * (self._low + self._span * throttle), 0.0)
 
     def channels(self, now: float) -> Sequence[int]:
-        """What the firmware's receiver has at a time [s], pulse widths [us]."""
+        """Return the channels for the firmware at a time [s], as pulse widths [us]."""
         channels = self.watchdog.channels(now)
         return channels if self._turning else (*CENTRED, *channels[len(CENTRED):])  # it arms with the throttle down only
 

@@ -1,11 +1,11 @@
-"""Component of the node `mavlink`: an autopilot that speaks MAVLink 2 (PX4, ArduPilot) follows body rates and thrust.
+"""Component of the node `mavlink`: commands an autopilot with MAVLink 2 (PX4, ArduPilot) by body rates and thrust.
 
 | to it | SET_ATTITUDE_TARGET (body rates, thrust), ODOMETRY with covariance, HEARTBEAT, TIMESYNC, COMMAND_LONG (mode, arm), PARAM_REQUEST_READ |
 | --- | --- |
 | from it | HEARTBEAT, HIGHRES_IMU, TIMESYNC, COMMAND_ACK, STATUSTEXT, PARAM_VALUE (GUID_OPTIONS of ArduPilot) |
 
-Where commands cease, so do set points: the autopilot's own failsafe for their loss then counts. The messages are those of `pymavlink`, an
-optional extra (`python3 scripts/setup.py --extra mavlink`).
+If commands stop, set points stop, and the autopilot's own failsafe for their loss takes effect. The messages are those of
+`pymavlink`, an optional extra (`python3 scripts/setup.py --extra mavlink`).
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ class MavlinkParameters:
 
 
 class ClockOffset:
-    """The autopilot's clock against the host's, by TIMESYNC: of several exchanges the one with the shortest way counts.
+    """Offset between the clocks of the host and the autopilot, by TIMESYNC: the exchange with the shortest round trip counts.
 
     Attributes:
-        offset: host's time - autopilot's [ns]; None: unknown.
+        offset: time of the host - time of the autopilot [ns]; None: unknown.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class ClockOffset:
         self._way = float("inf")
 
     def answered(self, sent: int, theirs: int, now: int) -> None:
-        """An answer to a request that was sent at a host's time, stamped by the autopilot, came now [ns]."""
+        """Record an answer: host's time of the request, stamp of the autopilot, host's time of arrival [ns]."""
         way = now - sent
         if not 0 <= way < NANOSECONDS:
             return
@@ -70,7 +70,7 @@ class Mavlink(Component[MavlinkParameters]):
     """Commands an autopilot over MAVLink.
 
     Attributes:
-        offboard: on the way to flying.
+        offboard: state of the autopilot and of the transition to its following mode.
     """
 
     config_type = MavlinkParameters
@@ -85,7 +85,7 @@ class Mavlink(Component[MavlinkParameters]):
         Raises:
             ConfigError: there is no such vehicle, or it takes other commands.
             LinkError: the link cannot be opened.
-            PerchError: pymavlink is not installed, no heartbeat comes, or that of another autopilot.
+            PerchError: pymavlink is not installed, no heartbeat arrives, or the autopilot is neither PX4 nor ArduPilot.
         """
         super().__init__(config)
         try:
@@ -123,14 +123,14 @@ class Mavlink(Component[MavlinkParameters]):
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
-        """Sent with the next poll, until it is stale."""
+        """Store a command, which each poll sends until it is stale."""
         if not sum(value * value for value in (*command.w_B, command.thrust)) < 1e8:
             self.warn("rates_thrust_command: not finite, or beyond any vehicle: ignored", every=1.0)
             return
         self._command, self._came = command, self._now or 0
 
     def on_odometry(self, state: OdometryState) -> None:
-        """On to the autopilot's own estimator, in its axes, by the host's clock, which it knows by TIMESYNC; at 50 Hz at most."""
+        """Send odometry to the autopilot's own estimator, in its axes, stamped by the host's clock (TIMESYNC); 50 Hz at most."""
         if self._sent is not None and 0 <= state.stamp - self._sent < _ODOMETRY_PERIOD:
             return
         self._sent = state.stamp
@@ -161,7 +161,7 @@ class Mavlink(Component[MavlinkParameters]):
     # -- from it -----------------------------------------------------------------------------------------------------
 
     def on_poll(self, now: int) -> None:
-        """Take what has come; send the command while it is fresh; once a second what keeps the connection."""
+        """Process received messages; send the command while it is fresh; once a second, heartbeat and TIMESYNC."""
         if self._now is None or (jump := jumped(self._now, now)):
             self._command, self._clock, self._begun, self._second = None, ClockOffset(), now, now - NANOSECONDS
             if self._now is not None:
@@ -188,7 +188,7 @@ class Mavlink(Component[MavlinkParameters]):
             self._diagnose(now)
 
     def _received(self, now: int) -> bytes:
-        """What has come; a link that has ended is opened anew."""
+        """Return the received bytes; reopen a link that has ended."""
         try:
             if self._link is None and not 0 <= now - self._opened < REOPEN * NANOSECONDS:
                 self._opened = now
@@ -199,7 +199,7 @@ class Mavlink(Component[MavlinkParameters]):
             return b""
 
     def _lose(self, error: LinkError) -> None:
-        """The link has ended: at its next beginning only the autopilot's kind and options are known."""
+        """Close a link that has ended, and reset all state but the autopilot's type and options."""
         self.log(LogLine("error", str(error), 1.0))
         self.close()
         self.offboard = Offboard(self.offboard.autopilot, options=self.offboard.options)
@@ -235,7 +235,7 @@ class Mavlink(Component[MavlinkParameters]):
             self.log(LogLine("warning" if message.severity <= 4 else "info", f"autopilot: {said}", 1.0))
 
     def _known(self, stamp: int, now: int) -> bool:
-        """Whether a sample's stamp, by the autopilot's clock [ns], can be converted; after a jump the clock is asked for anew."""
+        """Return whether a sample's stamp, by the autopilot's clock [ns], can be converted; after a jump, request the offset."""
         if self._sampled is not None and not 0 <= stamp - self._sampled < JUMP:
             self._jumps += 1
             if self._jumps < _JUMPED:
@@ -247,7 +247,7 @@ class Mavlink(Component[MavlinkParameters]):
         return self._clock.offset is not None
 
     def _trouble(self, now: int) -> str:
-        """Why it cannot follow; empty: it can."""
+        """Return why the autopilot cannot follow set points; empty if it can."""
         if absent := self._absent(now):
             return absent
         if not self.offboard.takes_thrust:
@@ -255,7 +255,7 @@ class Mavlink(Component[MavlinkParameters]):
         return ""
 
     def _absent(self, now: int) -> str:
-        """Why there is no autopilot to follow; empty: there is."""
+        """Return why no usable autopilot is present; empty if there is one."""
         if not self.offboard.alive(now * 1e-9):
             noise = f"; {self._torn} torn frames: is the baud rate right?" if self._torn else ": check its power, link and system id"
             return f"no heartbeat of the autopilot{noise}"
@@ -274,18 +274,18 @@ class Mavlink(Component[MavlinkParameters]):
                                      2 if trouble else 0, trouble or "ok"))
 
     def close(self) -> None:
-        """Close the link; the autopilot's failsafe for the loss of set points counts from now on."""
+        """Close the link: the autopilot's failsafe for the loss of set points takes effect."""
         if self._link is not None:
             self._link.close()
             self._link = None
 
 
 def _mode_words(mode: int) -> tuple[float, ...]:
-    """Custom mode of MAV_CMD_DO_SET_MODE: PX4 takes main and sub mode apart, ArduPilot one number."""
+    """Return the parameters of MAV_CMD_DO_SET_MODE for a custom mode: main and sub mode for PX4, one number for ArduPilot."""
     return (float(mode >> 16 & 255), float(mode >> 24 & 255)) if mode >> 16 else (float(mode),)
 
 
 def _upper(covariance: np.ndarray, axes: np.ndarray) -> list[float]:
-    """Upper triangle, row by row, of a covariance in other axes; its first entry is NaN where the covariance is not known."""
+    """Return the upper triangle, row by row, of a covariance in other axes; its first entry is NaN if it is unknown."""
     upper = frames.covariance(covariance, axes)[np.triu_indices(6)].tolist()
     return upper if covariance[0, 0] > 0.0 else [nan, *upper[1:]]

@@ -1,9 +1,9 @@
-"""MultiWii serial protocol, version 1, as Betaflight speaks it: frames, and the few messages that a companion computer needs.
+"""MultiWii serial protocol, version 1, as Betaflight implements it: frames, and the few messages that a companion computer needs.
 
     '$' 'M' direction  size  command  payload  checksum        direction: '<' request, '>' answer, '!' refused
                        u8    u8       size     xor of size, command and payload
 
-Numbers are little-endian. Axes of `RAW_IMU` are FLU; angles of `ATTITUDE` count roll to the right, nose down, and clockwise from north.
+Numbers are little-endian. `RAW_IMU` is in FLU; angles of `ATTITUDE` are positive to the right, nose down, clockwise from north.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ FC_VARIANT, FC_VERSION, ANALOG, RAW_IMU, ATTITUDE, STATUS, SET_RAW_RC = 2, 3, 11
 LONGEST = 255
 GYRO_LSB = 16.4  # readings per deg/s: the firmware's gyros have a range of 2000 deg/s
 VERSIONS = ((4, 3), (4, 6))
-"""Firmware with which the messages below have been read; later ones turn yaw's polarity."""
+"""Oldest and newest supported firmware; later versions invert the sign of yaw."""
 ARMING_REASONS = (
     "no gyro: check the sensor and the firmware's target", "failsafe: switch the radio on, and the arming switch off",
     "no radio signal (RX_FAILSAFE): switch the radio on, check the receiver", "not recovered from failsafe: switch the arming switch off",
@@ -33,24 +33,24 @@ ARMING_REASONS = (
     "DSHOT bitbang: set dshot_bitbang, or other pins", "accelerometer is not calibrated: calibrate it",
     "motor protocol is not set: set motor_pwm_protocol", "crash flip is switched on: switch it off",
     "altitude hold is switched on: switch it off", "position hold is switched on: switch it off")
-"""Why the firmware refuses to arm, and what to do: by bit of its flags. Their number differs from 4.3 to 4.6, and the last one is always
-the same."""
+"""Reasons for which the firmware refuses to arm, with remedies, by bit of its flags. Their number depends on the version;
+the last one is always `TOO_EARLY`."""
 LASTING = (0, 13, 17, 21, 22, 23, 24)
-"""Bits of the reasons that need a repair, a setting or a restart: they do not pass while the node waits."""
+"""Bits of the reasons that need a repair, a setting or a restart: waiting does not clear them."""
 TOO_EARLY = "arming switch was on too early: switch it off first"
 
 
 class MspError(PerchError):
-    """The other end does not speak MSP as it should."""
+    """Raised for invalid or refused MSP messages, and for autopilots that do not answer, are not supported or cannot fly."""
 
 
 class Frame(NamedTuple):
-    """An answer.
+    """An answer of the firmware.
 
     Attributes:
-        command: its number.
-        payload: its bytes.
-        refused: the other end does not know the command, or not now.
+        command: number of the command that is answered.
+        payload: bytes of the payload.
+        refused: whether the firmware rejects the command.
     """
 
     command: int
@@ -59,7 +59,7 @@ class Frame(NamedTuple):
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
-    """A request as bytes.
+    """Return a request as bytes.
 
     Raises:
         MspError: the payload is longer than a frame can be.
@@ -78,11 +78,11 @@ def _checksum(body: bytes) -> int:
 
 
 class Parser:
-    """Finds answers in a stream of bytes, in whatever pieces it comes.
+    """Finds answers in a stream of bytes that arrives in pieces of any size.
 
     Attributes:
-        torn: frames with a wrong checksum so far.
-        skipped: bytes that belong to no frame so far.
+        torn: number of frames with a wrong checksum.
+        skipped: number of bytes that belong to no frame.
     """
 
     def __init__(self) -> None:
@@ -90,7 +90,7 @@ class Parser:
         self.torn = self.skipped = 0
 
     def feed(self, data: bytes) -> list[Frame]:
-        """What `data` completes; bytes that are no frame are skipped, a torn frame costs its first byte only."""
+        """Return the frames that `data` completes. Bytes outside frames are skipped; of a torn frame, the first byte."""
         self._bytes += data
         buffer = self._bytes
         found: list[Frame] = []
@@ -123,7 +123,7 @@ class Parser:
 
 
 def _unpacked(layout: str, frame: Frame) -> tuple:
-    """The beginning of a frame's payload; later firmware appends."""
+    """Unpack the beginning of a frame's payload; later firmware appends fields to it."""
     size = struct.calcsize(layout)
     if frame.refused or len(frame.payload) < size:
         raise MspError(f"MSP {frame.command}: " + ("refused" if frame.refused else f"{len(frame.payload)} bytes, needs {size}"))
@@ -131,7 +131,7 @@ def _unpacked(layout: str, frame: Frame) -> tuple:
 
 
 class Version(NamedTuple):
-    """Of the firmware."""
+    """Variant and version number of a firmware."""
 
     variant: str
     number: tuple[int, int, int]
@@ -141,10 +141,10 @@ class Version(NamedTuple):
 
 
 def version(variant: Frame, number: Frame) -> Version:
-    """Of the answers to `FC_VARIANT` and `FC_VERSION`.
+    """Return the version in the answers to `FC_VARIANT` and `FC_VERSION`.
 
     Raises:
-        MspError: it is not Betaflight, or none of `VERSIONS`.
+        MspError: the firmware is not Betaflight, or its version is outside `VERSIONS`; or an answer is refused or too short.
     """
     found = Version(_unpacked("<4s", variant)[0].decode("ascii", "replace"), _unpacked("<3B", number))
     low, high = VERSIONS
@@ -154,12 +154,12 @@ def version(variant: Frame, number: Frame) -> Version:
 
 
 class Status(NamedTuple):
-    """Of the flight controller.
+    """Status of the flight controller.
 
     Attributes:
-        modes: flight modes that are on, a bit each, in the order of its boxes; bit 0 is ARM.
-        refusals: why it does not arm, empty: it does.
-        lasting: those of them that do not pass by themselves, nor by the pilot's switches.
+        modes: active flight modes, one bit each, in the order of the firmware's boxes; bit 0 is ARM.
+        refusals: reasons that prevent arming; empty if there are none.
+        lasting: those of them that clear neither by themselves nor by the pilot's switches.
     """
 
     modes: int
@@ -168,15 +168,15 @@ class Status(NamedTuple):
 
     @property
     def armed(self) -> bool:
-        """Whether the motors turn."""
+        """Whether the vehicle is armed."""
         return bool(self.modes & 1)
 
 
 def status(frame: Frame) -> Status:
-    """Of an answer to `STATUS` (MSP_STATUS_EX).
+    """Return the status in an answer to `STATUS` (MSP_STATUS_EX).
 
     Raises:
-        MspError: it is too short.
+        MspError: the answer is refused or too short.
     """
     modes, _, _, _, _, more = _unpacked("<6xIBHBBB", frame)
     at = 16 + (more & 0x0F)
@@ -198,10 +198,10 @@ class Battery(NamedTuple):
 
 
 def battery(frame: Frame) -> Battery:
-    """Of an answer to `ANALOG`.
+    """Return the battery in an answer to `ANALOG`.
 
     Raises:
-        MspError: it is too short.
+        MspError: the answer is refused or too short.
     """
     tenths, used, rssi, current = _unpacked("<BHHh", frame)
     voltage = _unpacked("<7xH", frame)[0] / 100.0 if len(frame.payload) >= 9 else tenths / 10.0
@@ -209,24 +209,24 @@ def battery(frame: Frame) -> Battery:
 
 
 def attitude(frame: Frame) -> tuple[float, float, float]:
-    """Roll, pitch, heading of an answer to `ATTITUDE` [rad], FRD against NED: roll to the right, nose up, clockwise from north.
+    """Return roll, pitch, heading in an answer to `ATTITUDE` [rad], FRD in NED: roll to the right, nose up, clockwise from north.
 
     Raises:
-        MspError: it is too short.
+        MspError: the answer is refused or too short.
     """
     roll, pitch, heading = _unpacked("<3h", frame)
     return radians(roll / 10.0), radians(-pitch / 10.0), radians(heading)
 
 
 def inertial(frame: Frame, one_g: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Specific force [m/s^2] and angular velocity [rad/s] of an answer to `RAW_IMU`, both in FLU.
+    """Return specific force [m/s^2] and angular velocity [rad/s] in an answer to `RAW_IMU`, both in FLU.
 
     Args:
         frame: the answer.
         one_g: reading of the accelerometer at rest (2048 with the usual sensors, 512 before 4.6, 256 in the simulated one).
 
     Raises:
-        MspError: it is too short.
+        MspError: the answer is refused or too short.
     """
     *force, p, q, r = _unpacked("<6h", frame)
     x, y, z = (9.81 * value / one_g for value in force)
@@ -234,5 +234,5 @@ def inertial(frame: Frame, one_g: float) -> tuple[tuple[float, float, float], tu
 
 
 def channels(values: tuple[int, ...]) -> bytes:
-    """The request `SET_RAW_RC` with pulse widths [us]."""
+    """Return the request `SET_RAW_RC` with pulse widths [us]."""
     return request(SET_RAW_RC, struct.pack(f"<{len(values)}H", *values))

@@ -1,8 +1,8 @@
-"""Starts a program in a network namespace of its own, and talks to it through sockets that were opened in there.
+"""Starts a program in a network namespace of its own, and communicates with it through sockets opened in that namespace.
 
-The firmware's ports are fixed and bound to all interfaces. In a namespace of its own, which has nothing but a loopback device,
-any number of them run beside each other and nobody else reaches one. A socket stays in the namespace in which it was opened:
-so the new process opens those that its parent asks for, hands them over, and becomes the program. Nothing is relayed.
+The firmware's ports are fixed and bound to all interfaces. In namespaces of their own, which have only a loopback device, any
+number of instances run side by side, and no other process can reach them. A socket stays in the namespace in which it was opened:
+the new process opens the sockets for its parent, passes them over, and then becomes the program. Nothing is relayed.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ os.execv(program[0], program)
 
 
 class NamespaceError(PerchError):
-    """The operating system gives no network namespace."""
+    """Raised when the operating system provides no network namespace."""
 
 
 class IsolatedProgram:
-    """A program in its namespace.
+    """A program in its own network namespace.
 
     Attributes:
         process: the program.
-        received: UDP socket bound to the port that was asked for, on the namespace's loopback device.
+        received: UDP socket bound to the requested port, on the namespace's loopback device.
         sent: UDP socket to send from.
         stream: TCP socket, not connected yet.
     """
@@ -49,11 +49,11 @@ class IsolatedProgram:
         """
         Args:
             program: absolute path and arguments.
-            folder: in which it runs.
-            port: of `received`.
+            folder: working directory of the program.
+            port: UDP port of `received`.
 
         Raises:
-            NamespaceError: there is no namespace to be had.
+            NamespaceError: no namespace is available.
         """
         unshare = shutil.which("unshare")
         if unshare is None:

@@ -1,4 +1,4 @@
-"""How an autopilot that speaks MAVLink is brought to follow: set points, its mode, then its motors. Pure: time is given to it."""
+"""Sequence that brings a MAVLink autopilot to follow set points: stream them, set its mode, arm. Pure: times are arguments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SILENT = 2.0                        # without a heartbeat for so long the autopi
 
 
 class Ask(Enum):
-    """What to ask of the autopilot."""
+    """Request to the autopilot."""
 
     NOTHING = 0
     MODE = 1
@@ -26,13 +26,13 @@ class Ask(Enum):
 
 @dataclass
 class Offboard:
-    """State of the way into offboard (PX4) or guided (ArduPilot) flight.
+    """State of the transition to offboard (PX4) or guided (ArduPilot) flight.
 
     Attributes:
-        autopilot: PX4, ARDUPILOT or another number, by its heartbeat; 0: none has come.
-        armed: its motors may turn.
-        following: its mode is the one in which it follows.
-        options: ArduPilot's GUID_OPTIONS, as far as it is known.
+        autopilot: PX4, ARDUPILOT or another number, from the heartbeat; 0: no heartbeat was received.
+        armed: whether the autopilot is armed.
+        following: whether the autopilot is in the mode in which it follows set points.
+        options: ArduPilot's GUID_OPTIONS; 0 until received.
     """
 
     autopilot: int = 0
@@ -45,32 +45,32 @@ class Offboard:
 
     @property
     def mode(self) -> int:
-        """Custom mode in which it follows."""
+        """Custom mode in which the autopilot follows set points."""
         return GUIDED_NOGPS if self.autopilot == ARDUPILOT else OFFBOARD
 
     def heartbeat(self, now: float, autopilot: int, base_mode: int, custom_mode: int) -> None:
-        """Take a heartbeat of the autopilot at a time [s]."""
+        """Record a heartbeat of the autopilot at a time [s]."""
         self._heard, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
         self.following = custom_mode == self.mode
 
     @property
     def takes_thrust(self) -> bool:
-        """Whether it takes a set point's thrust as a thrust, not as a climb rate."""
+        """Whether the autopilot interprets the thrust of a set point as thrust, not as a climb rate."""
         return self.autopilot == PX4 or (self.autopilot == ARDUPILOT and bool(self.options & THRUST_AS_THRUST))
 
     def alive(self, now: float) -> bool:
-        """Whether its heartbeat is of the present."""
+        """Return whether the last heartbeat is recent at a time [s]."""
         return 0.0 <= now - self._heard < SILENT
 
     def ask(self, now: float, wanted: bool, streaming: bool) -> Ask:
-        """What to ask for now.
+        """Return the request to send at a time, at most one each `AGAIN` seconds.
 
-        The mode is asked for with the motors off only: in flight the pilot selects it, and leaves it.
+        The mode is requested with the motors off only: in flight the pilot selects it, and leaves it.
 
         Args:
-            now: [s].
-            wanted: the motors shall turn.
-            streaming: set points are being sent.
+            now: time [s].
+            wanted: whether the motors are to turn.
+            streaming: whether set points are being sent.
         """
         if not streaming:
             self._streaming = None

@@ -1,4 +1,4 @@
-"""The firmware's rate curve, forwards and backwards. Without numpy: the process that holds the link starts quickly and stays small."""
+"""Rate curve of the firmware and its inverse. Without numpy, so that the link's process starts quickly and stays small."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class RateCurve:
 
     Attributes:
         centre: c, slope at the centre of the stick [deg/s].
-        most: m >= c, at its end [deg/s].
+        most: m >= c, rate at the end of the stick [deg/s].
         expo: e, 0..1.
     """
 
@@ -24,11 +24,11 @@ class RateCurve:
     expo: float
 
     def rate(self, stick: float) -> float:
-        """Angular velocity [deg/s] at a stick's deflection in [-1, 1]."""
+        """Return the angular velocity [deg/s] at a stick deflection in [-1, 1]."""
         return self.centre * stick + (self.most - self.centre) * abs(stick) * (self.expo * stick**5 + (1 - self.expo) * stick)
 
     def stick(self, rate: float) -> float:
-        """Deflection at which the firmware wants a rate [deg/s]; at its end for those beyond. By bisection, as the curve rises."""
+        """Return the stick deflection that commands a rate [deg/s], in [-1, 1]. By bisection, as the curve is monotonic."""
         if rate == 0.0:
             return 0.0
         if abs(rate) >= self.rate(1.0):

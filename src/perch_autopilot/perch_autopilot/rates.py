@@ -1,4 +1,4 @@
-"""From body rates and thrust to a pilot's sticks: the firmware's rate curve, and the vehicle's thrust curve, backwards."""
+"""Body rates and thrust to stick positions, by the inverses of the firmware's rate curve and the vehicle's thrust curve."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ AXES = ("roll", "pitch", "yaw")
 
 
 def rate_curves(settings: dict[str, str], source: str) -> tuple[RateCurve, ...]:
-    """The curves of roll, pitch and yaw of a configuration.
+    """Return the rate curves of roll, pitch and yaw of a configuration.
 
     Raises:
-        ConfigError: they are of another type, missing, or none that the firmware can have.
+        ConfigError: the curves are of another type, a setting is missing, or a value is outside the firmware's range.
     """
     if settings.get("rates_type") != "ACTUAL":
         raise ConfigError(source, "rates_type", f"{settings.get('rates_type')} is not ACTUAL, the one type that is known here")
@@ -43,10 +43,10 @@ def rate_curves(settings: dict[str, str], source: str) -> tuple[RateCurve, ...]:
 
 
 def commanded_vehicle(name: str) -> Vehicle:
-    """The vehicle of `config/vehicles/<name>.yaml`, or of a file, which an autopilot flies by body rates and thrust.
+    """Return the vehicle of `config/vehicles/<name>.yaml`, or of a file, which an autopilot flies by body rates and thrust.
 
     Raises:
-        ConfigError: no such vehicle, or it takes other commands.
+        ConfigError: no such vehicle, or one that takes other commands.
     """
     vehicle = load_vehicle(name)
     if vehicle.actuation.type != "rates_and_thrust":
@@ -55,49 +55,49 @@ def commanded_vehicle(name: str) -> Vehicle:
 
 
 class Sticks:
-    """Channels of body rates and thrust, in Betaflight's order AETR: roll, pitch, throttle, yaw, then switches.
+    """Conversion of body rates and thrust to channels, in Betaflight's order: roll, pitch, throttle, yaw.
 
     Attributes:
-        curves: of roll, pitch, yaw.
-        battery: how the thrust changes with the voltage.
+        curves: rate curves of roll, pitch, yaw.
+        battery: dependence of the thrust on the voltage.
     """
 
     def __init__(self, vehicle: Vehicle, curves: tuple[RateCurve, ...]) -> None:
         """
         Args:
-            vehicle: its mass and thrust curve.
-            curves: of roll, pitch, yaw.
+            vehicle: provides mass and thrust curve.
+            curves: rate curves of roll, pitch, yaw.
         """
         self.curves, self._mass, self._coefficient = curves, vehicle.mass, vehicle.thrust_coefficient
         self._idle, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
         self.battery, self._share = vehicle.actuation.battery, 1.0
 
     def fits(self, voltage: float) -> bool:
-        """Whether the thrust at a battery's voltage [V] is known."""
+        """Return whether the thrust curve covers a battery voltage [V]."""
         low, high = self.battery.range
         return not self.battery.reference or low <= voltage <= high
 
     def measured(self, voltage: float) -> None:
-        """Take the battery's voltage [V]; beyond the range of its curve the nearest end of that counts."""
+        """Set the battery's voltage [V], clamped to the range of the thrust curve."""
         if self.battery.reference:
             low, high = self.battery.range
             self._share = (min(max(voltage, low), high) / self.battery.reference) ** self.battery.exponent
 
     def throttle(self, thrust: float) -> float:
-        """Throttle 0..1 at which the four rotors together give a thrust per mass [m/s^2]: their speed is linear in it."""
+        """Return the throttle 0..1 for a collective thrust per mass [m/s^2]; the rotor speed is linear in the throttle."""
         speed = sqrt(max(thrust, 0.0) * self._mass / (4.0 * self._coefficient * self._share))
         return min(max((speed - self._idle) / self._span, 0.0), 1.0)
 
     def throttle_for(self, share: float) -> int:
-        """Throttle [us] that carries a share of the weight."""
+        """Return the throttle [us] that carries a share of the weight."""
         return self.channels((0.0, 0.0, 0.0), share * GRAVITY)[2]
 
     def channels(self, rates: Numbers, thrust: float) -> tuple[int, int, int, int]:
-        """Pulse widths [us] of roll, pitch, throttle, yaw.
+        """Return the pulse widths [us] of roll, pitch, throttle, yaw.
 
         Args:
             rates: angular velocity in FLU [rad/s]. Betaflight's sticks: roll to the right, nose *down*, nose to the right.
-            thrust: of all rotors per mass [m/s^2].
+            thrust: collective thrust per mass [m/s^2].
         """
         p, q, r = (degrees(rate) for rate in rates)
         roll, pitch, yaw = (round(CENTRE + HALF * curve.stick(rate)) for curve, rate in zip(self.curves, (p, q, -r)))

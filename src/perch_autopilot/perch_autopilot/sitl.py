@@ -38,25 +38,25 @@ GRAVITY = (0.0, 0.0, 9.81)
 
 
 class Frozen(FirmwareError):
-    """The firmware runs but does not answer."""
+    """Raised when the firmware runs but does not answer."""
 
 
 class Sitl:
     """A running firmware with its configuration.
 
     Attributes:
-        time: of the last packet [s].
+        time: time of the last packet [s].
     """
 
     def __init__(self, configuration: Configuration) -> None:
         """
         Args:
-            configuration: sent and read back where this firmware has not had it before.
+            configuration: sent and read back unless this firmware had it before.
 
         Raises:
-            FirmwareError: it is not there, or does not answer.
-            NamespaceError: no network namespace.
-            CliError: the configuration is refused, or not what is read back.
+            FirmwareError: the firmware is not installed, or does not answer.
+            NamespaceError: no network namespace is available.
+            CliError: the configuration is refused, or differs from what is read back.
         """
         self._program, self._configuration = firmware.found(), configuration
         self._running: IsolatedProgram | None = None
@@ -75,7 +75,7 @@ class Sitl:
     # -- start -------------------------------------------------------------------------------------------------------
 
     def _configured(self, draft: Path) -> Path:
-        """The firmware's memory with the configuration in it, made once by a firmware whose own is `draft`."""
+        """Return the memory file that holds the configuration; it is made once, by a firmware whose memory file is `draft`."""
         memory = self._program.parent / f"{self._configuration.identity}.eeprom"
         if not memory.exists():
             self._launch(draft)
@@ -108,19 +108,19 @@ class Sitl:
     # -- cycles ------------------------------------------------------------------------------------------------------
 
     def step(self, gyro: Numbers, force: Numbers, q_wxyz: Numbers, channels: Sequence[int]) -> tuple[float, ...]:
-        """One cycle of the firmware.
+        """Run one cycle of the firmware.
 
         Args:
             gyro: angular velocity in FLU [rad/s].
             force: specific force in FLU [m/s^2].
-            q_wxyz: orientation of B (FLU) in W (z up), which only self-levelling modes look at; sent turned about x, as the rates.
-            channels: pulse widths [us]; the rest of 16 are low.
+            q_wxyz: orientation of B (FLU) in W (z up), used by self-levelling modes only; sent turned about x, like the rates.
+            channels: pulse widths [us]; the rest of the 16 are set low.
 
         Returns:
             Motors 0..1: front left, rear left, rear right, front right.
 
         Raises:
-            Frozen: no answer.
+            Frozen: the firmware does not answer.
         """
         self.time += CYCLE
         running = self._firmware
@@ -146,12 +146,12 @@ class Sitl:
     # -- CLI and MSP -------------------------------------------------------------------------------------------------
 
     def send(self, data: bytes) -> None:
-        """Bytes to its serial port."""
+        """Send bytes to the firmware's serial port."""
         self._firmware.stream.settimeout(_ANSWER)
         self._firmware.stream.sendall(data)
 
     def receive(self, timeout: float) -> bytes:
-        """Bytes that have come from its serial port within a time [s]."""
+        """Return the bytes that arrive from the firmware's serial port within a time [s]."""
         self._firmware.stream.settimeout(timeout)
         try:
             return self._firmware.stream.recv(4096)
@@ -160,11 +160,11 @@ class Sitl:
 
     @property
     def file(self) -> int:
-        """File number of its serial port, for another that speaks MSP."""
+        """File number of the firmware's serial port, for another user of MSP."""
         return self._firmware.stream.fileno()
 
     def status(self) -> msp.Status:
-        """Of the firmware, as MSP tells it."""
+        """Request the firmware's status over MSP."""
         parser, last = msp.Parser(), time.monotonic() + _ANSWER
         self.send(msp.request(msp.STATUS))
         while time.monotonic() < last:
@@ -173,14 +173,14 @@ class Sitl:
         raise Frozen("Betaflight's firmware does not answer MSP")
 
     def close(self) -> None:
-        """End it."""
+        """End the firmware."""
         if self._running is not None:
             self._running.close()
             self._running = None
 
 
 def remove_orphans() -> None:
-    """Folders of those who were killed while the firmware had not read its memory yet."""
+    """Remove folders of processes that were killed before the firmware had read its memory."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*"):
         with suppress(OSError):  # another process has removed it
             if time.time() - folder.stat().st_mtime > _ORPHAN:

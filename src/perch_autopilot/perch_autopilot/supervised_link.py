@@ -1,8 +1,8 @@
-"""A separate process owns the link to the autopilot: it continues when the commanding node is killed, hangs, or is restarted.
+"""Link to the autopilot, owned by a separate process that continues when the commanding node is killed, hangs, or is restarted.
 
-Betaflight before 2026.6 holds the last MSP command for ever. Commands therefore go through this process, which sends frames at a fixed
-rate from the first command on; without fresh commands the `Watchdog` decides what they contain. It ends when the node has gone and the
-motors are off.
+Betaflight before 2026.6 holds the last MSP command for ever. Commands therefore pass through this process, which sends frames at
+a fixed rate from the first command on; without fresh commands the `Watchdog` determines their content. It ends when the node has
+ended and the motors are off.
 
     node -> supervisor   b"C" armed, 4 channels: a command       b"R" bytes: a request for the autopilot       b"H" hover, descent: throttles
                          b"T": the motors turn already
@@ -41,10 +41,10 @@ class LinkSupervisor:
                  clock: Callable[[], float] = time.monotonic) -> None:
         """
         Args:
-            address: of the link, see `Link`.
-            control: to the node.
-            watchdog: decides what the frames contain.
-            clock: [s].
+            address: address of the link, see `Link`.
+            control: socket to the node.
+            watchdog: determines the content of the frames.
+            clock: returns the time [s].
 
         Raises:
             LinkError: the link cannot be opened.
@@ -56,12 +56,12 @@ class LinkSupervisor:
         self._parser = msp.Parser()
 
     def run(self) -> None:
-        """Run until the node has gone and the motors are off."""
+        """Run until the node has ended and the motors are off."""
         while self._final_frames < _FINAL_FRAMES:
             self.work(max(0.0, self._due - self._clock()))
 
     def work(self, timeout: float) -> None:
-        """Handle what arrives within a time [s]; send a frame when it is due."""
+        """Process packets and bytes that arrive within a time [s]; send a frame when it is due."""
         control = [] if self._node_gone else [self._control.fileno()]
         link = [] if self._link is None else [self._link.file]
         ready = select.select(control + link, [], [], timeout)[0]
@@ -138,7 +138,7 @@ class LinkSupervisor:
 
 
 class SupervisedLink:
-    """The node's end."""
+    """The node's end of the supervised link."""
 
     def __init__(self, address: str, hover: int, descent: int, disarm_after: float, curves: Sequence[RateCurve]) -> None:
         """
@@ -171,7 +171,7 @@ class SupervisedLink:
         self._control.setblocking(False)
 
     def command(self, armed: bool, sticks: tuple[int, int, int, int]) -> None:
-        """Send a command; it is valid until it is stale."""
+        """Send a command, which is valid until it is stale."""
         self._send(b"C" + COMMAND.pack(armed, *sticks))
 
     def set_throttles(self, hover: int, descent: int) -> None:
@@ -179,11 +179,11 @@ class SupervisedLink:
         self._send(b"H" + THROTTLES.pack(hover, descent))
 
     def request(self, data: bytes) -> None:
-        """Send bytes to the autopilot beside the commands."""
+        """Send bytes to the autopilot in addition to the commands."""
         self._send(b"R" + data)
 
     def turning(self) -> None:
-        """Say that the motors turn already, before the first command."""
+        """Report that the motors turn already, before the first command."""
         self._send(b"T")
 
     def _send(self, packet: bytes) -> None:
@@ -191,7 +191,7 @@ class SupervisedLink:
             self._control.send(packet)
 
     def receive(self, timeout: float = 0.0) -> tuple[bytes, list[str]]:
-        """Bytes from the autopilot and messages of the supervisor that arrive within a time [s].
+        """Return the bytes from the autopilot and the messages of the supervisor that arrive within a time [s].
 
         Raises:
             LinkError: the process that holds the link has ended.
@@ -217,7 +217,7 @@ class SupervisedLink:
 
 
 def main() -> None:
-    """The process: address, file number, hover, descent, disarm_after; centre, most, expo of the curves of roll and pitch."""
+    """Run the supervisor: address, file number, hover, descent, disarm_after; centre, most, expo of roll's and pitch's curve."""
     address, number, hover, descent, disarm_after, *rest = sys.argv[1:]
     roll, pitch = (RateCurve(*map(float, rest[k:k + 3])) for k in (0, 3))
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

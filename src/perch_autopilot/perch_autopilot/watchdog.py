@@ -1,4 +1,4 @@
-"""What the autopilot receives when commands stop: level, descend, disarm; on the ground idle, disarm. Without a clock: times are arguments."""
+"""Channels for the autopilot when commands stop: level, descend, disarm; on the ground idle, disarm. Times are arguments."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class Mode(Enum):
 
 
 def lifts(sticks: Channels, hover: int) -> bool:
-    """Whether sticks ask for lift: for more than half of the throttle of a hover, or for a turn [us]."""
+    """Return whether sticks [us] command lift: more than half of the hover throttle, or a rotation beyond `TURN`."""
     roll, pitch, throttle, yaw = sticks
     return 2 * (throttle - CENTRED[2]) > hover - CENTRED[2] or max(abs(stick - CENTRED[0]) for stick in (roll, pitch, yaw)) > TURN
 
 
 class Watchdog:
-    """Decides which channels go to the autopilot: roll, pitch, throttle, yaw, then the switches arm and level.
+    """Selects the channels that are sent to the autopilot: roll, pitch, throttle, yaw, then the switches arm and level.
 
     Attributes:
         mode: present mode.
-        begun: a command has come; before, what flies already is left as it is.
+        begun: whether a command was received; until then nothing should be sent, as the vehicle may be in flight.
     """
 
     def __init__(self, hover: int, descent: int, disarm_after: float = DISARM_AFTER, arming: float = ARMING,
@@ -49,7 +49,7 @@ class Watchdog:
         Args:
             hover, descent: throttle that carries the weight, and that of the descent [us].
             disarm_after, arming: times [s], see `DISARM_AFTER`, `ARMING`.
-            curves: of roll and pitch, for levelling by rates; empty: the autopilot's self-level does all of it.
+            curves: rate curves of roll and pitch, for levelling by rates; empty: the autopilot's self-level mode alone is used.
         """
         self._curves, self._disarm_after, self._arming = curves, disarm_after, arming
         self._up, self._seen = (0.0, 0.0, 1.0), -1e9  # in B, and when [s]
@@ -62,27 +62,27 @@ class Watchdog:
         self._locked = False  # the motors were stopped: only a command to disarm allows arming again
 
     def set_throttles(self, hover: int, descent: int) -> None:
-        """Set the throttles of hover and descent [us]; they rise as the battery empties."""
+        """Set the throttles of hover and descent [us], which rise as the battery discharges."""
         self._hover, self._descent = hover, descent
 
     def attitude(self, now: float, roll: float, pitch: float) -> None:
-        """Take the autopilot's attitude at a time [s]: roll and pitch of FRD against NED [rad]."""
+        """Record the autopilot's attitude at a time [s]: roll and pitch of FRD against NED [rad]."""
         self._up, self._seen = up(roll, pitch), now
 
     def levels(self, now: float) -> bool:
-        """Whether its attitude is needed at a time [s]: commands are late."""
+        """Return whether the autopilot's attitude must be requested at a time [s], for levelling by rates: commands are late."""
         return bool(self._curves) and self._wanted and now - self._came > 0.5 * STALE_AFTER
 
     def turning(self) -> None:
-        """The motors turn before the first command, whose throttle therefore follows at once; it may fly."""
+        """Report motors that turn already: the first command is followed without the delay `ARMING`; the vehicle may fly."""
         self._turning = self._lifted = True
 
     def command(self, now: float, armed: bool, sticks: Channels) -> None:
-        """Take a command.
+        """Record a command.
 
         Args:
-            now: [s].
-            armed: whether the motors shall turn.
+            now: time [s].
+            armed: whether the motors are to turn.
             sticks: roll, pitch, throttle, yaw [us].
         """
         if armed and not (self._wanted or self._turning):
@@ -93,7 +93,7 @@ class Watchdog:
         self._locked = self._locked and armed
 
     def channels(self, now: float) -> Channels:
-        """Channels for the autopilot at a time [s], in us; never those of a stale command."""
+        """Return the channels for the autopilot at a time [s], in us, and set `mode`; stale commands are never returned."""
         age = now - self._came
         if not self._wanted or self._locked or age < 0.0:
             self.mode = Mode.DISARMED

@@ -1,4 +1,4 @@
-"""Components that look through a camera: images wait until they can be used, and are used in order."""
+"""Base classes of components that use a camera: images are queued until they can be used, and are used in order."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FUTURE = 0.5        # an image stamped this much ahead of the odometry cannot be
 
 
 class CameraConfig(Protocol):
-    """What the parameters of a camera's component hold."""
+    """Parameters that every camera component has."""
 
     @property
     def vehicle(self) -> str: ...
@@ -56,7 +56,7 @@ C = TypeVar("C", bound=CameraConfig)
 
 
 class CameraComponent(Component[C], ABC):
-    """Holds each image back until the camera is known and the image is covered; then `use` gets it, in the order of arrival."""
+    """Queues each image until the camera is known and the image is covered, then passes it to `use`, in the order of arrival."""
 
     image = Input(CameraImage, "camera_{camera}/{images}")
     camera_info = Input(CameraModel, "camera_{camera}/camera_info")
@@ -65,7 +65,7 @@ class CameraComponent(Component[C], ABC):
     def __init__(self, config: C) -> None:
         """
         Raises:
-            ConfigError: the vehicle has no such camera, or it is unusable.
+            ConfigError: the vehicle or sensor file has no such camera, or this component cannot use it.
         """
         super().__init__(config)
         cv2.setNumThreads(1)
@@ -84,29 +84,29 @@ class CameraComponent(Component[C], ABC):
         self._topic = self._channel("image")
 
     def warm_up(self) -> None:
-        """Load the compiled lens."""
+        """Load the compiled lens model ahead of the first image."""
         camera = self.mounted.nominal.camera
         rays = camera.unproject(np.zeros((1, 2)))
         camera.project(rays), camera.project_jacobian(rays)
 
     def unusable(self, mount: CameraMount) -> str:
-        """Why this component cannot use a camera; empty when it can."""
+        """Return the reason why this component cannot use a camera; empty where it can."""
         return ""
 
     @abstractmethod
     def use_camera(self, mount: CameraMount) -> None:
-        """The camera has become known, or is another one now."""
+        """Called when the camera has become known or has changed."""
 
     @abstractmethod
     def covers(self, image: CameraImage) -> bool:
-        """Whether all that an image needs is there, or the image cannot be waited for."""
+        """Whether all data that an image requires have been received, or cannot be expected any more."""
 
     @abstractmethod
     def use(self, image: CameraImage) -> None:
-        """Use, or refuse, one image."""
+        """Process or refuse one image."""
 
     def on_camera_info(self, model: CameraModel) -> None:
-        """The camera's intrinsics; of a sensor file they are known."""
+        """Take the camera's intrinsics; those of a sensor file take precedence."""
         if self._calibrated:
             model = model._replace(camera=self.mounted.nominal.camera)
         if self.mounted.take_model(model):
@@ -114,13 +114,13 @@ class CameraComponent(Component[C], ABC):
         self.advance()
 
     def on_transform(self, transform: Transform) -> None:
-        """Where a frame, perhaps the camera's, is in another."""
+        """Take a static transform, which may be that of the camera's frame."""
         if self.mounted.take_transform(transform):
             self.use_camera(self.mounted.known)
         self.advance()
 
     def on_image(self, image: CameraImage) -> None:
-        """Keep an image, and use what can be."""
+        """Queue an image, and use all images that can be used."""
         if self._calibrated and self.mounted.mount is None:
             self.on_camera_info(CameraModel(image.stamp, image.frame, self.mounted.nominal.camera))
         self._waiting.append(image)
@@ -133,12 +133,12 @@ class CameraComponent(Component[C], ABC):
         self.advance()
 
     def advance(self) -> None:
-        """Use the images that have become covered."""
+        """Use the queued images that are covered."""
         while self._waiting and self.mounted.mount is not None and self.covers(self._waiting[0]):
             self.use(self._waiting.popleft())
 
     def forget_images(self) -> None:
-        """Drop what waits: it belongs to another time."""
+        """Drop all queued images, e.g. after a restart of their data source."""
         self._waiting.clear()
 
     def _channel(self, port: str) -> str:
@@ -146,10 +146,10 @@ class CameraComponent(Component[C], ABC):
 
 
 class LocatedCameraComponent(CameraComponent[C]):
-    """Images are used once the odometry has passed their exposure.
+    """Camera component that uses an image once the odometry has passed its exposure.
 
-    Image and odometry come over different topics, and which is received first depends on the machine. An image that is handled
-    only once the state after its exposure is known gives the same result whatever the order.
+    Image and odometry arrive on different topics, in an order that depends on the machine. As an image is processed only once the
+    state after its exposure is known, the result does not depend on this order.
     """
 
     odometry = Input(OdometryState, "odometry", lazy=True)
@@ -168,21 +168,21 @@ class LocatedCameraComponent(CameraComponent[C]):
         """Use one image.
 
         Args:
-            image: its pixels are drawn or decoded when they are asked for.
+            image: its pixels are rendered or decoded on access.
             exposed: middle of its exposure on the IMU's clock [s].
         """
 
     def refuse(self, image: CameraImage, exposed: float, reason: str) -> None:
-        """An image must not be used."""
+        """Report that an image cannot be used."""
         self.warn(f"{self._topic}: {reason}", 1.0)
 
     def restart(self) -> None:
-        """Odometry has started anew: what was known is of another time."""
+        """Discard all states and images after a restart of the odometry."""
         self._begin()
         self.forget_images()
 
     def on_odometry(self, state: OdometryState) -> None:
-        """Where the vehicle was; images may have waited for it."""
+        """Store the vehicle's state, and use the images that it covers."""
         if not is_world(state.frame):
             self.warn(f"odometry: frame {state.frame!r} is no fixed frame known here: not used", 1.0)
             return
@@ -199,12 +199,12 @@ class LocatedCameraComponent(CameraComponent[C]):
             self.advance()
 
     def covers(self, image: CameraImage) -> bool:
-        """Whether the odometry has passed its exposure, or it must be refused."""
+        """Whether the odometry has passed the image's exposure, or the image must be refused."""
         exposed, newest = self._exposed(image), self.bodies.newest
         return exposed <= self._last or exposed <= newest or math.isfinite(newest) and exposed > newest + FUTURE
 
     def use(self, image: CameraImage) -> None:
-        """Look at an image, or refuse it."""
+        """Process an image, or refuse it where it is not newer than the last or is ahead of the odometry."""
         exposed, newest = self._exposed(image), self.bodies.newest
         if exposed <= self._last:
             self.refuse(image, exposed, f"image stamp {exposed:.4f} s is not newer than the last, {self._last:.4f} s")

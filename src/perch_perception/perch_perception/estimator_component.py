@@ -30,9 +30,9 @@ V = TypeVar("V", InertialState, OdometryState)
 
 
 class StateEstimator(Component[EstimatorConfig]):
-    """Emits `odometry` with the stamp of each IMU sample, with what VIO said before it; none before VIO's first pose: nobody knows then.
+    """Publishes `odometry` at the stamp of each IMU sample, from the VIO measurements so far; none before VIO's first pose.
 
-    VIO's odometry is ignored while VIO's whole state is available: nothing made of both can be better.
+    VIO's odometry is ignored while VIO's full state is available: it would add nothing.
     """
 
     config_type = EstimatorConfig
@@ -50,7 +50,7 @@ class StateEstimator(Component[EstimatorConfig]):
         self._begin()
 
     def _begin(self) -> None:
-        """With nothing known."""
+        """Reset to the state before the first sample."""
         self._estimator = Estimator(self.config)
         self._unused: list[tuple[int, bool, VioPose]] = []  # (stamp, odometry rather than a state, what it says)
         self._newest_state = _NEVER
@@ -60,7 +60,7 @@ class StateEstimator(Component[EstimatorConfig]):
         self._statuses = self._diagnoses = 0
 
     def on_transform(self, transform: Transform) -> None:
-        """Where a frame, perhaps the IMU's, is in another."""
+        """Take a static transform, which may be that of the IMU's frame."""
         self._intake.axes.add_transform(transform)
 
     def on_vio_state(self, state: InertialState) -> None:
@@ -72,7 +72,7 @@ class StateEstimator(Component[EstimatorConfig]):
         self._keep("vio/odometry", odometry, pose_of)
 
     def on_imu(self, sample: ImuSample) -> None:
-        """Use what VIO has said, move the state to the sample's stamp, and emit it."""
+        """Apply the pending VIO measurements, propagate the state to the sample's stamp, and publish it."""
         taken = self._intake.take(sample)
         if taken is None:
             return
@@ -99,7 +99,7 @@ class StateEstimator(Component[EstimatorConfig]):
             self._diagnose(sample.stamp)
 
     def _keep(self, channel: str, value: V, read: Callable[[V], VioPose]) -> None:
-        """Read a measurement."""
+        """Check and convert a measurement, and store it for the next IMU sample."""
         if not is_world(value.frame):
             self.warn(f"{channel}: frame {value.frame!r} is no fixed frame known here: not used", 1.0)
             return
@@ -114,7 +114,7 @@ class StateEstimator(Component[EstimatorConfig]):
         self._unused.append((pose.stamp, pose.inertial is None, pose))
 
     def _use_vio(self) -> None:
-        """In the order of the stamps; an odometry that has come with the state of the same stamp after it."""
+        """Apply the stored measurements in the order of their stamps; at the same stamp, the state precedes the odometry."""
         unused, self._unused = sorted(self._unused, key=lambda entry: entry[:2]), []
         for stamp, is_odometry, pose in unused:
             if is_odometry and stamp <= self._newest_state + STATES_LAST:

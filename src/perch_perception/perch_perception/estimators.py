@@ -1,4 +1,4 @@
-"""The state estimators that can be flown: name -> class. One of your own is one more line; see docs/howto/own_estimator.md."""
+"""Registry of the state estimators: name -> class. A custom one is added by one line; see docs/howto/own_estimator.md."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ ESTIMATORS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class EstimatorConfig(UkfConfig):
-    """Parameters of the node `estimator`; those of another estimator are a class derived from this one."""
+    """Parameters of the node `estimator`; another estimator derives its own class from this one."""
 
     type: str = text("ukf", doc="estimator, one of perch_perception.estimators")
 
 
 def estimator_class(name: Any) -> type[Component[Any]]:
-    """The component of an estimator.
+    """Return the component class of an estimator.
 
     Raises:
-        ConfigError: there is none with this name.
+        ConfigError: there is no estimator with this name.
     """
     if not isinstance(name, str) or name not in ESTIMATORS:
         raise ConfigError("estimator", "type", f"{name!r} is not one of {', '.join(ESTIMATORS)}")

@@ -1,4 +1,4 @@
-"""Pixels of an image as perception wants them: grey or in colour, of the camera's size."""
+"""Pixels of an image as perception requires them: grey or in colour, of the camera's size."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _BLUE_FIRST = ("bgr8", "8UC3")
 
 
 class ImageError(PerchError):
-    """An image that cannot be used: its encoding, its size, or its data."""
+    """Raised when an image cannot be used because of its encoding, size or data."""
 
 
 def check_image(image: CameraImage, camera: Camera) -> None:
-    """Refuse an image that cannot be one of the camera's, without looking at its pixels.
+    """Refuse an image whose encoding or size is not the camera's, without reading its pixels.
 
     Raises:
         ImageError: an encoding that is not 8 bits per channel, or a size other than the camera's.
@@ -30,15 +30,15 @@ def check_image(image: CameraImage, camera: Camera) -> None:
 
 
 def image_array(image: CameraImage, camera: Camera, region: Region | None = None) -> np.ndarray:
-    """The pixels, uint8 (height, width) or (height, width, 3) by the encoding.
+    """Return the pixels, uint8 (height, width) or (height, width, 3) by the encoding.
 
     Args:
-        image: drawn or decoded now, where it has not been.
-        camera: whose image it is.
-        region: what must hold; None: all of it.
+        image: it is rendered or decoded by this call, unless it already was.
+        camera: the image's camera.
+        region: part whose pixels must be valid; None: the whole image.
 
     Raises:
-        ImageError: see `check_image`; or pixels that are not what width, height and encoding say, or none.
+        ImageError: see `check_image`; also where pixels are missing or do not match width, height and encoding.
     """
     check_image(image, camera)
     pixels = image.pixels(region)
@@ -51,7 +51,7 @@ def image_array(image: CameraImage, camera: Camera, region: Region | None = None
 
 
 def mono_image(image: CameraImage, camera: Camera, region: Region | None = None) -> np.ndarray:
-    """The image in grey, uint8 (height, width). See `image_array`."""
+    """Return the image in grey, uint8 (height, width). See `image_array`."""
     pixels = image_array(image, camera, region)
     if pixels.ndim == 2:
         return pixels
@@ -59,7 +59,7 @@ def mono_image(image: CameraImage, camera: Camera, region: Region | None = None)
 
 
 def rgb_image(image: CameraImage, camera: Camera) -> np.ndarray:
-    """The image in colour, uint8 (height, width, 3). See `image_array`.
+    """Return the image in colour, RGB, uint8 (height, width, 3). See `image_array`.
 
     Raises:
         ImageError: also where the image has no colour.

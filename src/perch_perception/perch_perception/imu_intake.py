@@ -1,4 +1,4 @@
-"""IMU samples as the filters take them: in the axes of B, with stamps that can be believed."""
+"""IMU samples as the filters require them: in the axes of B, with checked stamps."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from perch_perception.stamp_guard import StampGuard, StampVerdict
 
 
 class ImuIntake:
-    """Turns samples into the axes of B and judges their stamps.
+    """Rotates samples into the axes of B and checks their stamps.
 
     Attributes:
-        axes: turns them; knows `/tf_static`.
-        restarted: the sample taken last belongs to a stream that has started anew; what came before it is of another time.
+        axes: rotates the samples; holds the transforms of `/tf_static`.
+        restarted: whether the latest sample begins a restarted stream, to which no earlier sample belongs.
     """
 
     def __init__(self, warn: Callable[[str, float], None], sensors: str = "") -> None:
-        """Arguments and errors as of `ImuAxes`."""
+        """Arguments and errors are those of `ImuAxes`."""
         self._warn = warn
         self.axes = ImuAxes(warn, sensors)
         self._guard = StampGuard()
         self.restarted = False
 
     def take(self, sample: ImuSample) -> ImuSample | None:
-        """The sample in the axes of B; None where it cannot be used."""
+        """Return the sample in the axes of B; None where it cannot be used."""
         self.restarted = False
         taken = self.axes.in_body(sample)
         if taken is None:

@@ -1,4 +1,4 @@
-"""The camera that a component looks through, as it becomes known: intrinsics from `camera_info`, place on the vehicle from file or TF."""
+"""Camera of a component as it becomes known: intrinsics from `camera_info`, extrinsics from a file or TF."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ CONFIRMATIONS = 5  # camera_info in a row with other intrinsics, after which the
 
 
 class MountedCamera:
-    """Rate, exposure and stamp offset are those of the vehicle file.
+    """Intrinsics and extrinsics of a camera; rate, exposure and stamp offset are those of `nominal`.
 
     Args:
-        nominal: the camera as the vehicle file has it.
-        extrinsics: `file`: its place on the vehicle is that of the file; `tf`: that of its optical frame in `/tf_static`.
+        nominal: the camera as the vehicle file or sensor file describes it.
+        extrinsics: `file`: those of `nominal`; `tf`: the pose of the camera's optical frame in `/tf_static`.
         warn: called with a warning and the least time between two of its kind [s].
 
     Attributes:
-        mount: the camera; None until it is known. It is `nominal` itself where nothing differs.
+        mount: the camera; None until it is known. With `file` and intrinsics equal to the nominal ones it is `nominal` itself.
     """
 
     def __init__(self, nominal: CameraMount, extrinsics: str, warn: Callable[[str, float], None]) -> None:
@@ -39,19 +39,19 @@ class MountedCamera:
 
     @property
     def known(self) -> CameraMount:
-        """`mount` where it is known: no image is used before."""
+        """`mount`, which must be known: no image is used before."""
         assert self.mount is not None
         return self.mount
 
     @property
     def missing(self) -> str:
-        """What is not known yet; empty where the camera is."""
+        """Description of what is not known yet; empty once the camera is known."""
         if self.mount is not None:
             return ""
         return f"no {self._topic} yet" if self._camera is None else f"/tf_static does not say yet where {self._frame!r} is in {BASE}"
 
     def take_model(self, model: CameraModel) -> bool:
-        """Take a camera's intrinsics; whether `mount` is another one now."""
+        """Take the camera's intrinsics; return whether `mount` has changed."""
         camera = model.camera
         if camera is self._camera or camera == self._camera:
             self._others = 0
@@ -66,14 +66,14 @@ class MountedCamera:
         return self._place()
 
     def take_transform(self, transform: Transform) -> bool:
-        """Take where a frame is in another; whether `mount` is another one now."""
+        """Take a static transform; return whether `mount` has changed."""
         problem = self._transforms.add(transform)
         if problem:
             self._warn(f"/tf_static: {problem}", 1.0)
         return self._by_transforms and self._camera is not None and self._place()
 
     def _is_confirmed(self, camera: Camera) -> bool:
-        """Whether other intrinsics have come often enough: one message of somebody else's camera must not upset a flight."""
+        """Whether other intrinsics were received often enough in a row; a single message of another camera is ignored."""
         self._others = self._others + 1 if camera == self._other else 1
         self._other = camera
         if self._others < CONFIRMATIONS:

@@ -1,7 +1,7 @@
-"""Where the vehicle was at a stamp: a short history of the estimator's states, interpolated.
+"""Short history of the estimator's states, interpolated at a stamp.
 
-Images arrive 20-30 ms after their exposure. At 3 m/s that is 9 cm, so no result may ever be combined with the pose of
-its arrival.
+Images arrive 20-30 ms after their exposure. At 3 m/s that is 9 cm, so an image's result must be combined with the pose at its
+exposure, never with the pose at its arrival.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAX_GAP = 0.05  # states further apart than this are not interpolated [s]
 
 
 class StampError(PerchError):
-    """There is no state at this stamp; the message says whether it is too old, too new or in a gap."""
+    """Raised when there is no state at a stamp: it is too old, too new or in a gap, or the state's covariance is invalid."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class BodyState:
         v_WB: velocity in W [m/s], shape (3,).
         w_WB_B: angular velocity in B [rad/s], shape (3,).
         covariance: of position and attitude, errors in the axes of W [m, rad], shape (6, 6).
-        corrected: what the odometry has moved its position by beside its velocity at speed, since the beginning, in W [m], shape (3,):
-            it found that it was elsewhere. Without it the motion is smooth, as the vehicle's own is.
+        corrected: sum of the odometry's position corrections at speed since the beginning, i.e. of displacement that its velocity
+            does not explain, in W [m], shape (3,). `p_WB - corrected` is as smooth as the vehicle's motion.
     """
 
     time: float
@@ -73,7 +73,7 @@ class PoseBuffer:
         return self._times[-1] if self._times else -np.inf
 
     def add(self, state: BodyState) -> bool:
-        """Append a state. False, and nothing happens, where it is not newer than the last or not finite."""
+        """Append a state. Return False, and ignore it, where it is not newer than the last or not finite."""
         if self._times and state.time <= self._times[-1]:
             return False
         squares = sum(x @ x for x in (state.p_WB, state.q_WB, state.v_WB, state.w_WB_B))
@@ -89,10 +89,10 @@ class PoseBuffer:
         return True
 
     def at(self, time: float) -> BodyState:
-        """The state at a time.
+        """Return the state at a time [s].
 
         Raises:
-            StampError: no states yet, older than the history, newer than the newest state, inside a gap, or with a covariance that is none.
+            StampError: no states yet, older than the history, newer than the newest state, in a gap, or an invalid covariance.
         """
         state = self._at(time)
         if said := _COVARIANCE.problem(state.covariance):
@@ -117,10 +117,10 @@ class PoseBuffer:
         return replace(_between(a, b, share), corrected=before + share * (self._corrected[right] - before))
 
     def _correction(self, state: BodyState) -> np.ndarray:
-        """`corrected` of a state that comes after the newest; a gap tells nothing of it.
+        """Return `corrected` for a state that follows the newest; it does not change across a gap.
 
-        Counted from `SLOW` on, in full from twice that: in a hover the position is held by what is seen, and the velocity's error,
-        some cm/s, would add up for as long as it lasts.
+        Corrections count above the speed `SLOW`, in full from twice that speed. In a hover vision holds the position, and the
+        velocity's error of some cm/s would accumulate.
         """
         if not self._states:
             return np.zeros(3)

@@ -37,7 +37,7 @@ class PowerlineMapperConfig:
 
 
 class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
-    """Emits the whole map for every image that is used, `rate` of them a second."""
+    """Publishes the whole map for every image that is used, at most `rate` images per second."""
 
     config_type = PowerlineMapperConfig
 
@@ -58,20 +58,20 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
             self.use_camera(self.mounted.mount)
 
     def unusable(self, mount: CameraMount) -> str:
-        """Red wires need colour."""
+        """Return the reason why a camera cannot be used; empty where it can: red wires require a colour camera."""
         return "no colour camera" if self.config.detection.appearance == "red" and not mount.colour else ""
 
     def use_camera(self, mount: CameraMount) -> None:
-        """What was seen through another lens is not compared."""
+        """Start a new backdrop: images of different cameras are not compared."""
         self._backdrop = Backdrop(mount.camera) if self.config.detection.appearance == "plain" else None
 
     def restart(self) -> None:
-        """Forget the map, too."""
+        """Also discard the map."""
         super().restart()
         self._forget()
 
     def look(self, image: CameraImage, exposed: float) -> None:
-        """Map one image where it is its turn, and tell."""
+        """Map one image, unless it exceeds `rate`, and publish the map."""
         if exposed - self._used < 1.0 / self.config.rate - 1e-3:
             return
         self._used = exposed
@@ -97,10 +97,10 @@ class PowerlineMapper(LocatedCameraComponent[PowerlineMapperConfig]):
 
 
 def mapping_pose(poses: PoseBuffer, exposed: float, max_sigma: float) -> BodyState:
-    """Where the vehicle was at an exposure [s], when that is known well enough to map.
+    """Return the vehicle's state at an exposure [s], where its position is known well enough for mapping.
 
     Raises:
-        StampError: there is no pose at this stamp, or its position is less certain than `max_sigma` [m].
+        StampError: there is no state at this stamp, or its position is less certain than `max_sigma` [m].
     """
     body = poses.at(exposed)
     sigma = largest_sigma(body.covariance[:3, :3])

@@ -1,4 +1,4 @@
-"""What the sensor file says: noise of the IMU, cameras and how well they are calibrated."""
+"""Contents of the sensor file: noise of the IMU, cameras and the accuracy of their calibration."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def sensors_parameter() -> str:
 
 
 def camera_mounts(sensors: str) -> dict[str, CameraMount]:
-    """The cameras of the sensor file; empty: no file is named, or it describes none.
+    """Return the cameras of the sensor file; empty where no file is named or it describes none.
 
     Raises:
         ConfigError: no such file, or a value that is refused.
@@ -26,7 +26,7 @@ def camera_mounts(sensors: str) -> dict[str, CameraMount]:
 
 
 def imu_noise(sensors: str, given: ImuNoise) -> ImuNoise:
-    """The IMU's noise by the sensor file; what was given where none is named.
+    """Return the IMU noise of the sensor file; `given` where no file is named.
 
     Raises:
         ConfigError: no such file, or it has no IMU.
@@ -41,9 +41,9 @@ def imu_noise(sensors: str, given: ImuNoise) -> ImuNoise:
 
 
 def calibration_sigmas(sensors: str, camera: str, given: CalibrationSigmas) -> CalibrationSigmas:
-    """How well a camera of the file is calibrated; what was given where no file is named.
+    """Return the calibration uncertainty of a camera of the sensor file; `given` where no file is named or it lacks the camera.
 
-    Which cameras there are is checked by whoever looks through them.
+    Whether the camera exists is checked by the component that uses it.
     """
     cameras = load_sensors(sensors).cameras if sensors else {}
     return cameras[camera].sigma if camera in cameras else given

@@ -1,4 +1,4 @@
-"""Which stamps of a stream can be believed: they grow, in steps that a sensor makes, until it has evidently started anew."""
+"""Plausibility check of a stream's stamps: they must increase in steps of at most `JUMP`, unless the stream has restarted."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ PATIENCE = 10         # as many in a row that follow each other, but not the las
 
 
 class StampVerdict(enum.Enum):
-    """What a stamp is."""
+    """Result of the check of a stamp."""
 
     GOOD = "follows the last one"
     REFUSED = "does not follow the last one"
@@ -17,13 +17,13 @@ class StampVerdict(enum.Enum):
 
 
 class StampGuard:
-    """Judges the stamps of one stream, in the order of their arrival.
+    """Checks the stamps of one stream, in the order of their arrival.
 
-    One wrong stamp must not spoil those after it, and a source that was started again (or whose clock was set) must be heard
-    again: a stamp that goes back, or jumps ahead, is refused until `PATIENCE` in a row agree with each other.
+    One wrong stamp must not invalidate those after it, and a source that was restarted (or whose clock was set) must be accepted
+    again. A stamp that goes back, or jumps ahead, is therefore refused until `PATIENCE` in a row are consistent with each other.
 
     Attributes:
-        last: the last stamp believed [ns]; None before the first.
+        last: the last accepted stamp [ns]; None before the first.
     """
 
     __slots__ = ("last", "_other", "_agreeing")
@@ -33,7 +33,7 @@ class StampGuard:
         self._other, self._agreeing = 0, 0
 
     def judge(self, stamp: int) -> StampVerdict:
-        """Take a stamp [ns]."""
+        """Check a stamp [ns]."""
         last = self.last
         if last is None or 0 < stamp - last <= JUMP:
             self.last, self._agreeing = stamp, 0

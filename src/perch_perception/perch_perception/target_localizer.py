@@ -48,20 +48,20 @@ class TargetLocalizerConfig:
 
 
 class Localizer(Protocol):
-    """What finds the board in an image: `BoardLocalizer`, or an error model in its place."""
+    """Finds the board in an image: `BoardLocalizer`, or an error model in its place."""
 
     def process(self, image: Callable[[Region | None], np.ndarray], exposed: float, body: BodyState | None) -> Localization:
-        """Look for the board.
+        """Localise the board.
 
         Args:
-            image: gives the grey image, uint8 (height, width), of which the region asked for holds.
+            image: returns the grey image, uint8 (height, width), in which the requested region is valid; None: the whole image.
             exposed: middle of its exposure [s].
-            body: state of the vehicle then, where it is known.
+            body: state of the vehicle at `exposed`, where it is known.
         """
 
 
 class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
-    """Emits `sighting` for every image and `pose` whenever the target is known well enough."""
+    """Publishes `sighting` for every image, and `pose` whenever a new estimate of the target is accurate enough."""
 
     config_type = TargetLocalizerConfig
 
@@ -72,7 +72,7 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
         """
         Args:
             config: parameters.
-            localizer: what finds the board; None: `BoardLocalizer`, once the camera is known.
+            localizer: finds the board; None: `BoardLocalizer`, once the camera is known.
 
         Raises:
             ConfigError: no such vehicle, camera or board.
@@ -86,20 +86,20 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
         self._diagnosed = -np.inf
 
     def use_camera(self, mount: CameraMount) -> None:
-        """Look through another lens, from another place."""
+        """Create a localiser for the camera, unless one was given."""
         if self._given is None:
             self._localizer = BoardLocalizer(self._board, mount, self.config.max_range, averaging=self.config.mode == "average",
                                              calibration=self.config.calibration)
 
     def restart(self) -> None:
-        """Forget the target, too."""
+        """Also discard the target."""
         super().restart()
         self._averaged = self._fused = None
         if self.mounted.mount is not None:
             self.use_camera(self.mounted.mount)
 
     def look(self, image: CameraImage, exposed: float) -> None:
-        """Localise the board in one image, and tell."""
+        """Localise the board in one image, and publish the result."""
         body, problem = None, ""
         try:
             body = self.bodies.at(exposed)
@@ -120,7 +120,7 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
         self._tell(result, body, exposed, problem)
 
     def refuse(self, image: CameraImage, exposed: float, reason: str) -> None:
-        """Tell why nothing is seen."""
+        """Publish an empty sighting with the reason."""
         super().refuse(image, exposed, reason)
         self._tell(Localization(None, message=reason), None, exposed, "")
 
@@ -144,7 +144,7 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
                                          1 if message else 0, message or "ok"))
 
     def _update(self, board: BoardPose, average: BoardPose | None, body: BodyState, sighting: TargetSighting) -> TargetSighting:
-        """Bring the target up to date by the mode, and tell where it is good enough."""
+        """Update the target by the mode, and publish its pose where it is accurate enough."""
         measured = to_map(average or board, body, self.mounted.known, self.config.calibration)
         target: FusedTarget | MapPose = measured
         fresh, frames, method = True, 1, self.config.mode

@@ -1,4 +1,4 @@
-"""Visual-inertial odometry: images of the downward camera and the IMU in, whole state and odometry for each frame out. [M:IV-B]"""
+"""Visual-inertial odometry: images of the downward camera and IMU samples in, full state and odometry per frame out. [M:IV-B]"""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DIAGNOSTICS_PERIOD = 1_000_000_000  # [ns]
 
 @dataclass(frozen=True)
 class VioComponentConfig(VioConfig):
-    """Parameters of the component: those of the odometry, and what it belongs to."""
+    """Parameters of the component: those of the odometry, vehicle and camera, and the pose at the start."""
 
     vehicle: str = config.text("snapdragon", doc="vehicle whose camera it is, config/vehicles/<name>.yaml")
     sensors: str = sensors_parameter()
@@ -39,10 +39,10 @@ class VioComponentConfig(VioConfig):
 
 
 class VioComponent(CameraComponent[VioComponentConfig]):
-    """Emits `state` and `odometry` for every frame that gives a pose, once the IMU has passed its exposure.
+    """Publishes `state` and `odometry` for every frame that gives a pose, once the IMU has passed its exposure.
 
     Attributes:
-        result: what became of the last frame.
+        result: of the last frame; None before the first.
     """
 
     config_type = VioComponentConfig
@@ -62,7 +62,7 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         self._begin()
 
     def _begin(self) -> None:
-        """On the ground, where the parameters say."""
+        """Reset the odometry to the configured start on the ground."""
         c = self.config
         standing = np.array(c.start_position) + [0.0, 0.0, self._standing_height]
         self._vio = VisualInertialOdometry(c, self.mounted.mount or self.mounted.nominal, standing, float(np.radians(c.start_yaw_deg)),
@@ -72,17 +72,17 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         self._diagnosed: int | None = None
 
     def use_camera(self, mount: CameraMount) -> None:
-        """Look through another lens, from another place."""
+        """Pass a changed camera to the odometry."""
         if mount is not self._vio.mount:
             self._vio.use_camera(mount)
 
     def on_transform(self, transform: Transform) -> None:
-        """Where a frame, perhaps the camera's or the IMU's, is in another."""
+        """Take a static transform, which may be that of the camera's or the IMU's frame."""
         self._intake.axes.add_transform(transform)
         super().on_transform(transform)
 
     def on_imu(self, sample: ImuSample) -> None:
-        """Keep a sample; images may have waited for it."""
+        """Take an IMU sample, and use the images that it covers."""
         taken = self._intake.take(sample)
         if taken is None:
             return
@@ -96,11 +96,11 @@ class VioComponent(CameraComponent[VioComponentConfig]):
             self.advance()
 
     def covers(self, image: CameraImage) -> bool:
-        """Whether the IMU has passed its exposure, or the stamp cannot be waited for."""
+        """Whether the IMU has passed the image's exposure, or its stamp is too far ahead to wait for."""
         return self._vio.covers(image.stamp)
 
     def use(self, image: CameraImage) -> None:
-        """Use a frame, and tell."""
+        """Process a frame, and publish the result."""
         pixels: np.ndarray | None = None
         try:
             pixels = mono_image(image, self.mounted.known.camera)

@@ -1,4 +1,4 @@
-"""Frames that do not move with the vehicle: what odometry may be expressed in."""
+"""Fixed frames, in which odometry may be expressed."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ _WORLD = frozenset((MAP, ODOM, "world", ""))
 
 
 def is_world(frame: str) -> bool:
-    """Whether a frame is one of `map`, `odom`, `world`, or not named."""
+    """Whether a frame is `map`, `odom`, `world` or unnamed."""
     return frame in _WORLD

@@ -1,4 +1,4 @@
-"""The simulated vehicle's body as the kernels take it: masses, rotors, and the points that can touch something."""
+"""Parameters of the simulated vehicle's body, as the kernels take them: mass, rotors, and contact points."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Body(NamedTuple):
 
 
 def _contact_points(vehicle: Vehicle) -> np.ndarray:
-    """Points of B that can touch: the plate's rim, then the rotor discs' rims, then the top, (n, 3)."""
+    """Return the contact points in B: rim of the plate, then rims of the rotor discs, then the top, (n, 3)."""
     def ring(count: int, radius: float, centre: np.ndarray) -> np.ndarray:
         angle = 2 * np.pi * (np.arange(count) + 0.5) / count
         return centre + radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
@@ -58,11 +58,11 @@ def _contact_points(vehicle: Vehicle) -> np.ndarray:
 
 
 def make_body(vehicle: Vehicle, disturbance: Disturbance = Disturbance()) -> Body:
-    """The body of a vehicle as it really flies.
+    """Return the true body of a vehicle.
 
     Args:
-        vehicle: what the vehicle's file says.
-        disturbance: how the real one differs.
+        vehicle: vehicle as its file describes it.
+        disturbance: differences of the true vehicle from its file.
     """
     mass = vehicle.mass * disturbance.mass_factor
     inertia = np.array(vehicle.inertia) * disturbance.inertia_factor

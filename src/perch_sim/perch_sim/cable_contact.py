@@ -1,9 +1,9 @@
-"""Contact with cables: when the gripper closes, and what a cable in the rotors does.
+"""Contact with cables: closing of the gripper, and crash if a cable enters the rotors.
 
-The gripper sits `perch_offset` below the centre of mass and opens along -b3; it turns freely about its axis. It closes
-as soon as the cable is in the claw, or goes no deeper into it, while all tolerances of the scenario hold: position, tilt
-and speed of the gripper against the cable. Tilt is how far b3 is from being square to the cable: the pitch about it is free.
-A cable that leaves the gripper's reach again without that was missed, and the event tells how it was when nearest.
+The gripper is `perch_offset` below the centre of mass and opens along -b3; it turns freely about its axis. It closes as
+soon as the cable is in the claw, or no longer moves into it, while all tolerances of the scenario hold: position, tilt and
+speed of the gripper relative to the cable. Tilt is the deviation of b3 from perpendicular to the cable: pitch about the
+cable is free. A cable that leaves the gripper's reach without this was missed; the event reports the values when nearest.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAX_ERROR = 1e-3   # of a cable's straight pieces [m]
 
 
 class Nearest(NamedTuple):
-    """The point of a cable that is nearest to a point."""
+    """Point of a cable that is nearest to a given point."""
 
     point_W: np.ndarray      # (3,) [m]
     direction: np.ndarray    # of the cable there, unit, (3,)
@@ -34,7 +34,7 @@ class Nearest(NamedTuple):
 
 
 class CableLine:
-    """A cable as straight pieces."""
+    """A cable, approximated by straight pieces."""
 
     def __init__(self, cable: Cable) -> None:
         # the sagitta of an arc: pieces so short that none is further than MAX_ERROR from the cable
@@ -46,7 +46,7 @@ class CableLine:
         self.radius = cable.radius
 
     def nearest(self, p_W: np.ndarray) -> Nearest:
-        """Nearest point of the axis to `p_W` (3,) [m]."""
+        """Return the nearest point of the axis to `p_W` (3,) [m]."""
         along = np.clip(((p_W - self._start) * self._direction).sum(axis=1), 0.0, self._length)
         points = self._start + along[:, None] * self._direction
         distances = np.linalg.norm(points - p_W, axis=1)
@@ -54,7 +54,7 @@ class CableLine:
         return Nearest(points[k], self._direction[k], float(distances[k]))
 
     def enters(self, p_WB: np.ndarray, R_WB: np.ndarray, radii: np.ndarray) -> bool:
-        """Whether the cable enters the ellipsoid of the body, inflated by the wire's radius."""
+        """Return whether the cable enters the ellipsoid of the body, inflated by the wire's radius."""
         scale = radii + self.radius
         a = (self._start - p_WB) @ R_WB / scale
         d = (self._direction * self._length[:, None]) @ R_WB / scale
@@ -63,7 +63,7 @@ class CableLine:
 
 
 def grip_refusal(distance: float, tilt: float, speed: float, grip: Grip) -> str:
-    """Why the gripper does not hold, one clause per missed limit; empty: it holds. [m], [rad], [m/s]"""
+    """Return why the gripper does not hold, one clause per violated limit; empty if it holds. [m], [rad], [m/s]"""
     problems = [
         (distance > grip.position, f"the cable passed at {distance:.3f} m, beyond {grip.position:g} m"),
         (math.degrees(tilt) > grip.tilt_deg, f"{math.degrees(tilt):.1f} deg from square, above {grip.tilt_deg:g} deg"),
@@ -74,15 +74,15 @@ def grip_refusal(distance: float, tilt: float, speed: float, grip: Grip) -> str:
 
 
 class CableMonitor:
-    """Follows the cables near a vehicle. Owns the gripper's hold; a cable in the rotors is a crash."""
+    """Monitors the cables near a vehicle. Owns the hold of the gripper; a cable in the rotors is a crash."""
 
     def __init__(self, cables: tuple[Cable, ...], grip: Grip, gripper_offset: float, radii: np.ndarray) -> None:
         """
         Args:
-            cables: of the world.
-            grip: tolerances.
-            gripper_offset: gripper below the centre of mass [m].
-            radii: semi-axes of the ellipsoid that holds the body and its rotors, (3,) [m].
+            cables: cables of the world.
+            grip: tolerances of the gripper.
+            gripper_offset: distance of the gripper below the centre of mass [m].
+            radii: semi-axes of the ellipsoid that contains the body and its rotors, (3,) [m].
         """
         self._lines = [CableLine(cable) for cable in cables]
         self._grip, self._offset, self._radii = grip, gripper_offset, np.array(radii, float)
@@ -94,15 +94,15 @@ class CableMonitor:
         self.crashed = False
 
     def release(self) -> None:
-        """Open the gripper; it can close again when no cable is within reach."""
+        """Open the gripper; it can close again after all cables were out of reach."""
         self._open = self._open or self._attachment is not None
         self._attachment, self.hold = None, FREE
 
     def update(self, time: float, x: np.ndarray) -> list[Contact]:
-        """What changed since the last call, one control period ago; the caller stamps it.
+        """Return the contact events since the last call, one control period ago; the caller stamps them.
 
         Args:
-            time: [s].
+            time: time since the start of the flight [s].
             x: state (13,).
         """
         if self._attachment is not None:
@@ -131,13 +131,13 @@ class CableMonitor:
         return events
 
     def _missed(self, k: int) -> list[Contact]:
-        """The pass of a cable is over."""
+        """End the pass of a cable, and return its event, if there is one."""
         event, self._nearest[k] = self._nearest[k], None
         return [] if event is None else [event]
 
     def _within_reach(self, time: float, k: int, x: np.ndarray, R_WB: np.ndarray, gripper_W: np.ndarray,
                       near: Nearest) -> list[Contact]:
-        """Grip the cable, or remember how near it came."""
+        """Grip the cable, or record the refusal at the smallest distance."""
         event = self._event(ContactState.BOUNCED, k, x, R_WB, near, "")
         speed = math.hypot(event.normal_speed, event.tangential_speed)
         refusal = grip_refusal(near.distance, event.tilt_error, speed, self._grip)

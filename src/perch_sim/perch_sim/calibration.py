@@ -1,7 +1,7 @@
-"""How the true sensors differ from what the vehicle's file, and so CameraInfo and the filters' noise, says of them.
+"""Differences between the true sensors and the vehicle's file, from which CameraInfo and the noise of the filters are taken.
 
-Nothing that is declared holds exactly: each error has a scale of its own in every flight, up to half as large again or as small as the
-declared one divided by that, and calibration errors have heavier tails than a normal distribution.
+No declared value holds exactly: in every flight each error has its own scale, between 1 / `SPREAD` and `SPREAD` times the
+declared one, and calibration errors have heavier tails than a normal distribution.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ def _scales(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def true_imu(imu: ImuConfig, seed: int) -> ImuConfig:
-    """The IMU of a flight as it really is: noise, bias walks and turn-on biases."""
+    """Return the true IMU of a flight: noise, bias walks and standard deviations of the turn-on biases."""
     names = ("accel_noise", "gyro_noise", "accel_bias_walk", "gyro_bias_walk", "accel_bias_init", "gyro_bias_init")
     scales = _scales(seeding.stream(seed, "imu_scales"), len(names)).tolist()
     return dataclasses.replace(imu, **{name: scale * getattr(imu, name) for name, scale in zip(names, scales)})
 
 
 def true_mounts(scenario: Scenario, mounts: Mapping[str, CameraMount], seed: int) -> dict[str, CameraMount]:
-    """The cameras of a flight as they really are; those of an ideal scenario are as calibrated."""
+    """Return the true cameras of a flight; those of an ideal scenario are as calibrated."""
     if scenario.realism != "default":
         return dict(mounts)
     return {name: true_mount(mount, seeding.stream(seed, f"calibration_{name}")) for name, mount in mounts.items()}
 
 
 def true_mount(mount: CameraMount, rng: np.random.Generator) -> CameraMount:
-    """The camera as it really is, for a calibration with errors drawn from `rng`.
+    """Return the true camera, for a calibration with errors drawn from `rng`.
 
     Args:
         mount: the camera as calibrated.
-        rng: the camera's own stream.
+        rng: random stream of this camera.
     """
     draw = np.clip(rng.standard_t(FREEDOM, 8) * np.sqrt(1 - 2 / FREEDOM), -LARGEST, LARGEST) * np.repeat(_scales(rng, 4), (2, 2, 3, 1))
     camera = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Images of one camera: exposed along the true trajectory, drawn while the flight goes on, delivered at arrival."""
+"""Images of one camera: exposed along the true trajectory, rendered while the flight continues, delivered at arrival."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ POSES = 5  # of the body, spread over an exposure
 
 
 class Delivery(NamedTuple):
-    """A frame on its way; `image` is None where the camera takes no images."""
+    """A frame that was exposed and not yet delivered; `image` is None if it has no image."""
 
     frame: Frame
     image: ImageToCome | None
 
 
 class CameraStream:
-    """The frames of one camera in order. They are drawn elsewhere while the flight goes on.
+    """Frames of one camera in order. Their images are rendered elsewhere while the flight continues.
 
     Attributes:
-        most_waiting: a frame that begins while so many of this camera are still being drawn goes without its image; None: every
-            image is drawn, however long it takes.
-        dropped: images that were given up.
-        broken: whoever draws the images has ended; the frames come without them.
+        most_waiting: while so many images of this camera are being rendered, further frames go without image; None: all images
+            are rendered, however long it takes.
+        dropped: number of images that were not rendered.
+        broken: whether the process that renders the images has ended; frames then have no image.
     """
 
     def __init__(self, mount: CameraMount, timing: CameraTiming, draw: Callable[..., ImageToCome] | None,
@@ -41,11 +41,11 @@ class CameraStream:
         """
         Args:
             mount: the camera as calibrated, for CameraInfo.
-            timing: its frames.
-            draw: begins an image, `Drawing.draw` of this camera; None: the frames keep their times, but no images are drawn.
-            noise: the sensor's own stream; each frame gets a child, so that frames can be drawn in any order.
-            target_velocity: of the pad in W [m/s], (3,).
-            start: time at which the pad is where the scene has it [ns].
+            timing: generates the frame times.
+            draw: begins an image, `Drawing.draw` of this camera; None: only the frame times are simulated.
+            noise: random stream of the sensor; each frame gets a child, so that frames can be rendered in any order.
+            target_velocity: velocity of the pad in W [m/s], (3,).
+            start: time at which the pad has its position in the scene [ns].
         """
         self.mount = mount
         self._timing, self._begin = timing, draw
@@ -58,7 +58,7 @@ class CameraStream:
         self._coming: deque[Delivery] = deque()
 
     def expose(self, time: int, history: StateHistory) -> None:
-        """Start to draw every frame whose exposure has ended by `time` [ns]."""
+        """Begin to render every frame whose exposure has ended by `time` [ns]."""
         while self._next.end <= time:
             frame, self._next = self._next, self._timing.next()
             image = None
@@ -69,7 +69,7 @@ class CameraStream:
             self._coming.append(Delivery(frame, image))
 
     def due(self, time: int) -> Delivery | None:
-        """The oldest frame, if it has arrived by `time` [ns]; it stays until `take`."""
+        """Return the oldest frame if it has arrived by `time` [ns], otherwise None; the frame remains until `take`."""
         if not self._coming or self._coming[0].frame.arrival > time:
             return None
         frame, image = self._coming[0]
@@ -79,11 +79,11 @@ class CameraStream:
         return self._coming[0]
 
     def take(self) -> Delivery:
-        """Remove the oldest frame."""
+        """Remove and return the oldest frame."""
         return self._coming.popleft()
 
     def give_up(self) -> None:
-        """An image will never come."""
+        """Record that an image is lost, as the process that renders it has ended."""
         self.dropped += 1
         self.broken = True
 
@@ -99,6 +99,6 @@ class CameraStream:
 
 
 def _exposure(places: list[Place], seed: np.random.SeedSequence, shift: np.ndarray) -> tuple[list[Pose], np.random.Generator, np.ndarray]:
-    """The arguments of `Renderer.render`."""
+    """Return the arguments of `Renderer.render`."""
     p_WB, q_WB = between(places)
     return list(zip(p_WB, so3.quat_to_matrix(q_WB))), np.random.default_rng(seed), shift

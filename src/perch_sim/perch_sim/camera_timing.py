@@ -1,7 +1,7 @@
-"""When a camera exposes, and when its image arrives.
+"""Times at which a camera exposes, and at which its images arrive.
 
-All times are the IMU's clock in whole nanoseconds, as stamps are. The stamp of an image is the board's: the middle of
-the exposure plus the camera's stamp offset. It arrives after read-out and transport.
+All times are on the IMU's clock, in whole nanoseconds, as stamps are. An image carries the stamp of the camera board: the
+middle of the exposure plus the camera's stamp offset. It arrives after read-out and transport.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ TRIGGER_JITTER = 50_000  # of the exposure's start, one sigma [ns]
 
 
 class Frame(NamedTuple):
-    """One exposure. Times in nanoseconds."""
+    """One exposure; times in nanoseconds."""
 
     number: int
     start: int     # of the exposure
@@ -32,22 +32,22 @@ class Frame(NamedTuple):
 
 
 class CameraTiming:
-    """The frames of one camera, one after the other."""
+    """Generates the frames of one camera in order."""
 
     def __init__(self, mount: CameraMount, exposure: float, first: int, rng: np.random.Generator) -> None:
         """
         Args:
             mount: the true camera.
-            exposure: what its exposure control chose for the light [s].
+            exposure: exposure time that the exposure control sets for the light [s].
             first: earliest start of an exposure [ns].
-            rng: the camera's own stream.
+            rng: random stream of this camera.
         """
         self._mount, self._exposure, self._rng = mount, round(exposure * NANOSECONDS), rng
         self._first = first + int(rng.uniform(0.0, 1.0 / mount.rate) * NANOSECONDS)
         self._index = 0
 
     def next(self) -> Frame:
-        """The next frame."""
+        """Return the next frame."""
         mount, n = self._mount, self._index
         self._index += 1
         jitter = int(np.clip(self._rng.standard_normal(), -3.0, 3.0) * TRIGGER_JITTER)

@@ -1,7 +1,7 @@
-"""The rules of contact: when the velcro holds, what is a bounce, a landing, a collision or a crash.
+"""Rules of contact: adhesion of the velcro, bounce, landing, collision and crash.
 
-Forces are in `dynamics`; here it is decided what a touch means. The limits of adhesion are facts of the material and
-come from the scenario.
+Forces are computed in `dynamics`; this module classifies touches. The limits of adhesion are properties of the material
+and are taken from the scenario.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LANDING_TILT = math.radians(45.0)  # steeper on the floor is no landing
 
 
 class Impact(NamedTuple):
-    """How the plate meets a surface."""
+    """Motion of the plate relative to a surface as they meet."""
 
     normal_speed: float      # into the surface [m/s]
     tangential_speed: float  # [m/s]
@@ -34,12 +34,12 @@ class Impact(NamedTuple):
 
 
 def impact_of(x: np.ndarray, plate_offset: float, p_WS: np.ndarray, R_WS: np.ndarray, v_WS: np.ndarray) -> Impact:
-    """The impact of the plate's centre on a surface.
+    """Return the impact of the plate's centre on a surface.
 
     Args:
         x: state (13,).
-        plate_offset: plate below the centre of mass [m].
-        p_WS, R_WS, v_WS: the surface's origin [m], axes and velocity [m/s].
+        plate_offset: distance of the plate below the centre of mass [m].
+        p_WS, R_WS, v_WS: origin [m], axes and velocity [m/s] of the surface.
     """
     R_WB = so3.quat_to_matrix(x[3:7])
     arm_B = np.array([0.0, 0.0, -plate_offset])
@@ -49,7 +49,7 @@ def impact_of(x: np.ndarray, plate_offset: float, p_WS: np.ndarray, R_WS: np.nda
 
 
 def adhesion_refusal(impact: Impact, adhesion: Adhesion, pad_half: np.ndarray) -> str:
-    """Why the velcro does not hold, one clause per missed limit; empty: it holds."""
+    """Return why the velcro does not hold, one clause per violated limit; empty if it holds."""
     low, high = adhesion.normal_speed
     beside = float(np.max(np.abs(impact.offset_S[:2]) - pad_half))
     tilt = math.degrees(impact.tilt_error)
@@ -66,7 +66,7 @@ def adhesion_refusal(impact: Impact, adhesion: Adhesion, pad_half: np.ndarray) -
 
 
 class ContactMonitor:
-    """Follows touches over time. Owns what holds the vehicle and whether it has crashed."""
+    """Tracks and classifies touches over time. Owns the hold of the velcro and the crash state."""
 
     def __init__(self, plate_offset: float, obstacles: Obstacles, adhesion: Adhesion) -> None:
         self._plate_offset, self._obstacles, self._adhesion = plate_offset, obstacles, adhesion
@@ -82,21 +82,21 @@ class ContactMonitor:
 
     @property
     def free(self) -> bool:
-        """Whether nothing was touched lately."""
+        """Whether nothing is attached, and nothing was touched within `SEPARATION`."""
         return not (self._touched or self.attached)
 
     def release(self) -> None:
-        """Let go; what is touched still is not held again before it was left."""
+        """Release the velcro; a surface that is still touched can hold again only after a separation."""
         self._attachment, self.hold = None, FREE
 
     def update(self, time: float, before: np.ndarray, x: np.ndarray, touched: np.ndarray) -> list[Contact]:
-        """What changed at this instant; the caller stamps it.
+        """Return the contact events of this instant; the caller stamps them.
 
         Args:
-            time: [s].
-            before: state one integration step ago (13,): an impact is judged before its forces have worked.
+            time: time since the start of the flight [s].
+            before: state one integration step earlier (13,): impacts are classified by it, before their forces act.
             x: state (13,).
-            touched: of each surface, as `dynamics.clearances` writes it (m, 3); negative distances touch.
+            touched: clearances of each surface, from `dynamics.clearances` (m, 3); a negative distance is a touch.
         """
         events = []
         for s in range(len(touched)):
@@ -128,7 +128,7 @@ class ContactMonitor:
                        impact.tilt_error, offset, reason)
 
     def _judge(self, s: int, impact: Impact, rest: bool, speed: float) -> tuple[ContactState, str]:
-        """What a touch is; `speed` is that of its fastest point into the surface [m/s]."""
+        """Classify a touch, and record a crash; `speed` is that of its fastest point into the surface [m/s]."""
         name, fast = self._obstacles.names[s], speed > CRASH_SPEED
         too_fast = f"hit the {name} with {speed:.2f} m/s, above {CRASH_SPEED:g} m/s"
         if self.crashed:
@@ -156,7 +156,7 @@ class ContactMonitor:
         return [Contact(0, ContactState.NONE, self._obstacles.names[over[0]], 0.0, 0.0, 0.0, 0.0, "")]
 
     def _attach(self, time: float, s: int, x: np.ndarray, p_WS: np.ndarray) -> None:
-        """Hold the plate where it touched; it is then drawn flat on the surface."""
+        """Hold the plate where it touched; it is then pulled flat onto the surface."""
         normal = self._obstacles.surfaces.axes[s, :, 2]
         plate_W = x[:3] - self._plate_offset * so3.quat_to_matrix(x[3:7])[:, 2]
         flat_W = plate_W - ((plate_W - p_WS) @ normal) * normal

@@ -1,4 +1,4 @@
-"""What a touch is reported as."""
+"""States of a contact, as they are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the cameras' images are drawn: in this process when they are looked at, or in processes of their own while the flight goes on."""
+"""Rendering of the cameras' images: in this process when they are read, or in separate processes in parallel with the flight."""
 
 from __future__ import annotations
 
@@ -29,53 +29,53 @@ PIPE_SIZE = 1 << 20  # holds an image, so that neither end waits for the other [
 
 
 class ImageToCome(Protocol):
-    """An image that is being drawn.
+    """An image that is being rendered.
 
     Attributes:
-        on_demand: it is drawn when somebody looks at it; nobody needs to wait for it.
+        on_demand: whether it is rendered when it is read, so that waiting for it is unnecessary.
     """
 
     on_demand: bool
 
     def done(self, timeout: float = 0.0) -> bool:
-        """Whether it is there; waits for it up to `timeout` [s]."""
+        """Return whether the image is complete; wait for it up to `timeout` [s]."""
 
     def result(self, region: Region | None = None) -> np.ndarray | None:
-        """The image, uint8, as `Renderer.render`; None: whoever draws has ended.
+        """Return the image, uint8, as `Renderer.render`; None if the process that renders it has ended.
 
         Args:
-            region: rows and columns that matter to who asks first; the rest need not be drawn. None: all of it.
+            region: rows and columns that the first caller needs; the rest need not be rendered. None: all of it.
         """
 
 
 class Drawing(Protocol):
-    """Draws images of some cameras."""
+    """Renders the images of some cameras."""
 
     cameras: tuple[str, ...]
 
     def draw(self, camera: str, exposure: Exposure) -> ImageToCome:
-        """Begin the image of one exposure: `Renderer.render` of that camera."""
+        """Begin to render the image of one exposure, by `Renderer.render` of that camera."""
 
     def ready(self) -> bool:
-        """Whether images that are ordered now come without delay."""
+        """Return whether images can be rendered without a start-up delay."""
 
     def close(self) -> None:
-        """End what draws."""
+        """End the rendering processes, if any."""
 
 
 class DrawnOnDemand:
-    """Images drawn in this process when somebody looks at them, and not at all where nobody does.
+    """Renders images in this process when they are read; images that are not read are never rendered.
 
-    On a thread they are drawn no sooner where every core has a flight of its own, and drawing and flight wait for each
+    A thread would not be faster where every core runs a flight of its own, and rendering and flight would wait for each
     other's interpreter lock.
     """
 
     def __init__(self, scenario: Scenario, seed: int, cameras: Collection[str]) -> None:
         """
         Args:
-            scenario: what is seen.
-            seed: of the flight.
-            cameras: names of those that take images; the scene is laid out when somebody looks at the first of them.
+            scenario: provides the scene.
+            seed: seed of the flight.
+            cameras: names of the cameras that take images; the scene is built when the first image is read.
         """
         self.cameras = tuple(cameras)
         self._scenario, self._seed = scenario, seed
@@ -94,11 +94,11 @@ class DrawnOnDemand:
         return self._renderers[camera].render(*exposure(), region=region)
 
     def ready(self) -> bool:
-        """Always."""
+        """Return True: there is no start-up delay to wait for."""
         return True
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing: there are no processes."""
 
 
 class _Undrawn:
@@ -118,19 +118,19 @@ class _Undrawn:
 
 
 class DrawnInProcesses:
-    """Images drawn by one process per camera.
+    """Renders images in one process per camera.
 
-    A thread beside the loop of a node asks for the interpreter's lock some fifty times per image and waits each time until the
-    loop lets go of it: an image took 30 ms instead of 10, and the loop lost time as well.
+    A thread in the node's process requests the interpreter lock some fifty times per image, and waits each time until the
+    node's loop releases it: an image took 30 ms instead of 10, and the loop was delayed as well.
     """
 
     def __init__(self, scenario: Scenario, seed: int, cameras: Collection[str]) -> None:
-        """Start the processes; they draw their textures while the caller goes on.
+        """Start the processes, which draw their textures in the background.
 
         Args:
-            scenario: what is seen.
-            seed: of the flight.
-            cameras: names of those that take images.
+            scenario: provides the scene.
+            seed: seed of the flight.
+            cameras: names of the cameras that take images.
 
         Raises:
             ConfigError: the scenario's vehicle or board does not exist.
@@ -143,7 +143,7 @@ class DrawnInProcesses:
         return self._draftsmen[camera].draw(exposure)
 
     def ready(self) -> bool:
-        """Whether every process has laid out its textures and drawn a first image, or has ended."""
+        """Return whether every process has drawn its textures and rendered a first image, or has ended."""
         return all(draftsman.ready() for draftsman in self._draftsmen.values())
 
     def close(self) -> None:
@@ -155,7 +155,7 @@ class DrawnInProcesses:
 
 
 class _Draftsman:
-    """This side of a process that draws the images of one camera, in the order in which they are asked for."""
+    """Client of a process that renders the images of one camera, in the order of the requests."""
 
     def __init__(self, scene: Scene, mount: CameraMount, seed: int) -> None:
         orders, self._orders = Pipe(duplex=False)
@@ -175,7 +175,7 @@ class _Draftsman:
         self._ready = self._ended = False
 
     def ready(self) -> bool:
-        """Whether images can be ordered that come without delay, or none will come any more."""
+        """Return whether the process can render without a start-up delay, or has ended."""
         if not self._ready:
             self.receive(0.0)
         return self._ready or self._ended
@@ -192,7 +192,7 @@ class _Draftsman:
         return image
 
     def receive(self, timeout: float) -> bool:
-        """Take what comes next, an image or the greeting before the first one, if it comes in time."""
+        """Receive an image, or the greeting before the first one, within a time [s]; return whether one was received."""
         try:
             if self._ended or not self._poll.poll(1e3 * timeout):
                 return False
@@ -233,7 +233,7 @@ class _Ordered:
 
 
 def _seen(scenario: Scenario, seed: int, cameras: Collection[str]) -> list[tuple[str, Scene, CameraMount]]:
-    """What each camera looks at, and the camera as it really is."""
+    """Return name, scene and true camera of each camera."""
     scene = build_scene(scenario, seed)
     mounts = true_mounts(scenario, load_vehicle(scenario.vehicle).mounts, seed)
     return [(name, scene, mounts[name]) for name in cameras]

@@ -1,6 +1,6 @@
-"""The process that draws the images of one camera. Run by `drawing.DrawnInProcesses`, never by hand.
+"""Process that renders the images of one camera; started by `drawing.DrawnInProcesses` only.
 
-A module of its own, so that such a process loads what draws, and nothing of the node that starts it.
+It is a separate module, so that the process imports what rendering needs, and nothing else of the node that starts it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NICE = 5  # the step goes first; but those who wait for an image give way to it 
 
 
 def draw_until_closed(orders: Connection, images: Connection) -> None:
-    """Receive scene, mount and seed; say that images can be drawn; then draw one for each order, what `Renderer.render` takes."""
+    """Receive scene, mount and seed; report readiness; then render one image per order, the arguments of `Renderer.render`."""
     renderer = Renderer(*orders.recv())
     renderer.render([(np.array([0.0, 0.0, 1.0]), np.eye(3))], np.random.default_rng(0))  # loads what is compiled
     images.send_bytes(GREETING)
@@ -30,7 +30,7 @@ def draw_until_closed(orders: Connection, images: Connection) -> None:
 
 
 def main() -> None:
-    """Serve the pipes of orders and of images, whose numbers are on the command line."""
+    """Serve the pipes of orders and of images, whose file numbers are on the command line."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller decides when this ends
     end_with_parent(signal.SIGTERM)
     give_way(0, NICE)

@@ -1,9 +1,9 @@
 """Compiled kernels of the plant: rigid body, rotors, contact forces, one Runge-Kutta step.
 
-These equations are the simulator's own; a test holds them against plain numpy (tests/oracles/rigid_body.py). Written out
-in scalars: numba needs about 1 us for a step, numpy 200 us.
+These equations are used by the simulator only; a test compares them with plain numpy (tests/oracles/rigid_body.py). They are
+written in scalars: numba needs about 1 us for a step, numpy 200 us.
 
-State `x` (13): p_WB (3) [m], q_WB (4, xyzw), v_WB (3) [m/s], w_WB_B (3) [rad/s]. Rotor speeds (4) [rad/s] are apart,
+State `x` (13): p_WB (3) [m], q_WB (4, xyzw), v_WB (3) [m/s], w_WB_B (3) [rad/s]. Rotor speeds (4) [rad/s] are separate,
 as their lag has an exact solution.
 """
 
@@ -26,7 +26,7 @@ NO_CONTACT = 1e3       # clearance of what is out of reach [m]
 
 
 class Hold(NamedTuple):
-    """What holds the plate or the gripper: a point and an attitude, approached through stiff springs."""
+    """Hold of the plate or the gripper: a point and an attitude, to which stiff springs pull the body."""
 
     active: bool
     surface: int          # row of the surface that holds, -1: none of them
@@ -37,7 +37,7 @@ class Hold(NamedTuple):
 
 @compiled
 def rotation(q: np.ndarray) -> np.ndarray:
-    """R_WB of a unit quaternion xyzw, (3, 3)."""
+    """Return R_WB of a unit quaternion xyzw, (3, 3)."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     R = np.empty((3, 3))
     R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
@@ -48,7 +48,7 @@ def rotation(q: np.ndarray) -> np.ndarray:
 
 @compiled
 def _point_velocity(x: np.ndarray, R: np.ndarray, r: np.ndarray, out: np.ndarray) -> None:
-    """Velocity in W of the body point r_B: v + R (w x r)."""
+    """Compute the velocity in W of the body point r_B: v + R (w x r), written to `out`."""
     a = x[11] * r[2] - x[12] * r[1]
     b = x[12] * r[0] - x[10] * r[2]
     c = x[10] * r[1] - x[11] * r[0]
@@ -71,7 +71,7 @@ def _add_force(R: np.ndarray, r: np.ndarray, f_W: np.ndarray, force_W: np.ndarra
 
 @compiled
 def _depth(s: int, point_W: np.ndarray, surfaces: Surfaces, time: float) -> float:
-    """Signed distance of a point to surface `s`, NO_CONTACT beside its rectangle or behind it [m]."""
+    """Return the signed distance of a point from surface `s` [m]; NO_CONTACT beside its rectangle or behind it."""
     d0 = point_W[0] - surfaces.origin[s, 0] - surfaces.velocity[s, 0] * time
     d1 = point_W[1] - surfaces.origin[s, 1] - surfaces.velocity[s, 1] * time
     d2 = point_W[2] - surfaces.origin[s, 2] - surfaces.velocity[s, 2] * time
@@ -86,7 +86,7 @@ def _depth(s: int, point_W: np.ndarray, surfaces: Surfaces, time: float) -> floa
 
 @compiled
 def _near(s: int, x: np.ndarray, surfaces: Surfaces, time: float, reach: float) -> bool:
-    """Whether any point within `reach` of the centre of mass can be below surface `s`."""
+    """Return whether a point within `reach` of the centre of mass can be below surface `s`."""
     z = 0.0
     for i in range(3):
         z += (x[i] - surfaces.origin[s, i] - surfaces.velocity[s, i] * time) * surfaces.axes[s, i, 2]
@@ -96,7 +96,7 @@ def _near(s: int, x: np.ndarray, surfaces: Surfaces, time: float, reach: float) 
 @compiled
 def _contact_forces(x: np.ndarray, R: np.ndarray, body: Body, surfaces: Surfaces, hold: Hold, time: float,
                     force_W: np.ndarray, torque_B: np.ndarray) -> None:
-    """Springs, dampers and friction of every contact point that is inside a surface."""
+    """Add the forces of springs, dampers and friction at the contact points that are inside a surface."""
     for s in range(surfaces.origin.shape[0]):
         if not _near(s, x, surfaces, time, body.reach):
             continue
@@ -131,7 +131,7 @@ def _contact_forces(x: np.ndarray, R: np.ndarray, body: Body, surfaces: Surfaces
 @compiled
 def _hold_forces(x: np.ndarray, R: np.ndarray, body: Body, hold: Hold,
                  force_W: np.ndarray, torque_B: np.ndarray) -> None:
-    """Springs and dampers between an attached plate and what holds it."""
+    """Add the forces of springs and dampers between an attached plate or gripper and its hold."""
     r, velocity, f = np.zeros(3), np.empty(3), np.empty(3)
     r[2] = -body.plate_offset
     _point_velocity(x, R, r, velocity)
@@ -153,7 +153,7 @@ def _hold_forces(x: np.ndarray, R: np.ndarray, body: Body, hold: Hold,
 
 @compiled
 def _effect(x: np.ndarray, R: np.ndarray, xy: np.ndarray, body: Body, surfaces: Surfaces, time: float) -> float:
-    """Thrust gain of a rotor whose wash meets a surface: 1 / (1 - (R / 4z)^2) of Cheeseman and Bennett."""
+    """Return the thrust gain of a rotor near a surface: 1 / (1 - (R / 4z)^2), by Cheeseman and Bennett."""
     gain, point = 1.0, np.empty(3)
     for s in range(surfaces.origin.shape[0]):
         facing = 0.0
@@ -170,15 +170,15 @@ def _effect(x: np.ndarray, R: np.ndarray, xy: np.ndarray, body: Body, surfaces: 
 @compiled
 def derivative(x: np.ndarray, speeds: np.ndarray, wind: np.ndarray, body: Body, surfaces: Surfaces, hold: Hold,
                time: float, out: np.ndarray) -> None:
-    """Time derivative of the state, written to `out` (13,). [M:eq1]
+    """Compute the time derivative of the state, written to `out` (13,). [M:eq1]
 
     Args:
         x: state (13,).
         speeds: rotor speeds (4,) [rad/s].
         wind: air velocity in W (3,) [m/s].
-        body, surfaces, hold: see there.
-        time: [s], for surfaces that move.
-        out: receives p', q', v', w'.
+        body, surfaces, hold: see `Body`, `Surfaces`, `Hold`.
+        time: time [s], for surfaces that move.
+        out: set to p', q', v', w'.
     """
     R = rotation(x[3:7])
     force_W, torque = np.zeros(3), np.zeros(3)
@@ -219,7 +219,7 @@ def derivative(x: np.ndarray, speeds: np.ndarray, wind: np.ndarray, body: Body, 
 
 @compiled
 def lagged(speeds: np.ndarray, command: np.ndarray, time_constant: float, step: float) -> np.ndarray:
-    """Rotor speeds after `step` seconds of a constant command: the exact first-order lag, (4,)."""
+    """Return the rotor speeds after `step` seconds of a constant command: the exact first-order lag, (4,)."""
     fade = math.exp(-step / time_constant) if time_constant > 0.0 else 0.0
     return command + (speeds - command) * fade
 
@@ -227,13 +227,13 @@ def lagged(speeds: np.ndarray, command: np.ndarray, time_constant: float, step: 
 @compiled
 def advance(x: np.ndarray, speeds: np.ndarray, command: np.ndarray, wind: np.ndarray, body: Body, surfaces: Surfaces,
             hold: Hold, time: float, step: float, inertial: np.ndarray) -> None:
-    """One Runge-Kutta step of the fourth order; `x` and `speeds` are overwritten, the quaternion normalised.
+    """Advance one Runge-Kutta step of fourth order; `x` and `speeds` are overwritten, the quaternion normalised.
 
     Args:
-        command: rotor speeds that the motors aim at (4,) [rad/s].
-        time: at the start of the step [s].
+        command: target speeds of the rotors (4,) [rad/s].
+        time: time at the start of the step [s].
         step: duration [s].
-        inertial: receives the mean specific force and the mean angular velocity at the IMU in B over the step, (6,).
+        inertial: set to the mean specific force and the mean angular velocity at the IMU in B over the step, (6,).
     """
     before = x.copy()
     k1, k2, k3, k4 = np.empty(13), np.empty(13), np.empty(13), np.empty(13)
@@ -269,16 +269,16 @@ def advance(x: np.ndarray, speeds: np.ndarray, command: np.ndarray, wind: np.nda
 
 @compiled
 def clearances(x: np.ndarray, before: np.ndarray, body: Body, surfaces: Surfaces, time: float, out: np.ndarray) -> float:
-    """What each surface meets, written to `out` (m, 3).
+    """Compute the clearances of each surface, written to `out` (m, 3).
 
-    Its columns are the smallest distances of the plate and of everything else [m], and the greatest speed into the surface of a
-    point that is inside [m/s], one step earlier: an impact is judged before its forces have worked.
+    Its columns are the smallest distances of the plate and of all other points [m], and the greatest speed into the surface of
+    a point that is inside [m/s], one step earlier: an impact is classified by the state before its forces act.
 
     Args:
         x, before: state, and that one step earlier (13,).
 
     Returns:
-        The smallest distance of all [m]; NO_CONTACT where nothing is in reach.
+        The smallest distance of all [m]; NO_CONTACT if no surface is in reach.
     """
     R, point, velocity, least = rotation(x[3:7]), np.empty(3), np.empty(3), NO_CONTACT
     R_before = rotation(before[3:7])
@@ -307,15 +307,15 @@ def clearances(x: np.ndarray, before: np.ndarray, body: Body, surfaces: Surfaces
 def advance_to_touch(x: np.ndarray, speeds: np.ndarray, command: np.ndarray, wind: np.ndarray, body: Body,
                      surfaces: Surfaces, hold: Hold, time: float, step: float, path: np.ndarray, inertial: np.ndarray,
                      touched: np.ndarray) -> tuple[int, bool]:
-    """Steps of `advance` until something is touched: one call per control period in free flight.
+    """Make steps of `advance` until a surface is touched: one call per control period in free flight.
 
     Args:
-        path: receives the state after each step (n, 13); n is the most steps that are made.
-        inertial: gains what `advance` gives in each step, (6,).
-        touched: as in `clearances`, after the last step.
+        path: set to the state after each step (n, 13); n is the greatest number of steps.
+        inertial: sum to which `inertial` of `advance` is added in each step, (6,).
+        touched: set to the clearances after the last step, as `out` of `clearances`.
 
     Returns:
-        Steps made, and whether something is touched after the last one.
+        Number of steps, and whether a surface is touched after the last one.
     """
     sample, before = np.empty(6), np.empty(13)
     for k in range(path.shape[0]):

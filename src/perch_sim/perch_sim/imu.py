@@ -1,4 +1,4 @@
-"""The IMU: noise, turn-on bias, bias walk, saturation."""
+"""Model of the IMU: noise, turn-on bias, bias walk, saturation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perch_core.vehicle import ImuConfig
 
 
 class ImuSample(NamedTuple):
-    """What the board reads; both in the axes of B."""
+    """Sample of the IMU, in the axes of B."""
 
     accel: np.ndarray  # specific force, (3,) [m/s^2]
     gyro: np.ndarray   # angular velocity, (3,) [rad/s]
@@ -21,8 +21,8 @@ class ImuSample(NamedTuple):
 class Imu:
     """Turns true specific force and angular velocity into samples.
 
-    The sensor averages over its sample period, so its truth is the mean of the period that ends at the stamp. At rest
-    and level it reads +g along z.
+    The sensor averages over its sample period, so its true input is the mean over the period that ends at the stamp. At
+    rest and level it measures +g along z.
     """
 
     def __init__(self, config: ImuConfig, rng: np.random.Generator) -> None:
@@ -35,7 +35,7 @@ class Imu:
         _read(np.zeros(6), self.bias.copy(), np.zeros(12), self._walk, self._noise, self._range, np.empty(6))  # loaded now
 
     def sample(self, inertial: np.ndarray) -> ImuSample:
-        """One sample.
+        """Return one sample.
 
         Args:
             inertial: mean specific force [m/s^2] and angular velocity [rad/s] at the IMU in B, (6,).
@@ -47,7 +47,7 @@ class Imu:
 
 @compiled
 def _read(inertial, bias, draw, walk, noise, limits, reading):
-    """A sample in `reading` (6,), of specific force and angular velocity; `bias` (6,) walks on. `draw` (12,) is white, unit variance."""
+    """Write a sample to `reading` (6,), and advance the random walk `bias` (6,); `draw` (12,) is white noise of unit variance."""
     for i in range(6):
         bias[i] += walk[i] * draw[i]
         reading[i] = min(max(inertial[i] + bias[i] + noise[i] * draw[6 + i], -limits[i]), limits[i])

@@ -1,7 +1,7 @@
-"""An ideal rate or attitude loop in front of the rotors: first-order lags on the true state, and a mixer that saturates.
+"""Ideal rate or attitude loop in front of the rotors: first-order lags on the true state, and a mixer that saturates.
 
-It knows the vehicle as its file says, its own rotors' speeds and the true rates, and leads its rotors so far that moment and thrust are
-there after a control period wherever the rotors can reach them. Written apart from `perch_control.inner_loop`, which has a model of it.
+It uses the vehicle's file, the rotor speeds and the true rates. It compensates the rotors' lag: moment and thrust are reached
+after one control period where the rotors permit. It is independent of `perch_control.inner_loop`, which has a model of it.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ FIRMWARE = "perch_autopilot.loop:FirmwareLoop"  # an optional extra, loaded wher
 
 
 def inner_loop(vehicle: Vehicle, lag_factor: float, voltage_factor: float = 1.0) -> InnerLoop | Any:
-    """What stands between commands and the rotors; None: nothing does.
+    """Return the inner loop between commands and rotors; None for a vehicle that takes rotor speeds.
 
     Raises:
-        PerchError: it is a firmware that this machine does not have.
+        PerchError: the vehicle's firmware is not installed, or does not start.
     """
     if vehicle.actuation.type == "rotor_speeds":
         return None
@@ -35,13 +35,13 @@ def inner_loop(vehicle: Vehicle, lag_factor: float, voltage_factor: float = 1.0)
 
 @compiled
 def mixed(thrust, moment, mixing, low, high):
-    """Rotor thrusts within their bounds: roll and pitch are scaled together, then yaw, then the collective thrust gives way.
+    """Return rotor thrusts within their bounds, by priority: roll and pitch, scaled together; yaw, scaled; thrust, clamped.
 
     Args:
-        thrust: collective [N].
-        moment: in B [N m], (3,).
-        mixing: (thrust, moments) to rotor thrusts, (4, 4).
-        low, high: of a rotor [N].
+        thrust: collective thrust [N].
+        moment: moment in B [N m], (3,).
+        mixing: matrix from (thrust, moments) to rotor thrusts, (4, 4).
+        low, high: thrust bounds of a rotor [N].
 
     Returns:
         (4,) [N].
@@ -62,7 +62,7 @@ def mixed(thrust, moment, mixing, low, high):
 
 @compiled
 def rates_of_attitude(q, wanted, rates, lag):
-    """Body rates that an attitude loop asks for: those fed forward, and the rotation to the wanted attitude over `lag`, (3,) [rad/s]."""
+    """Return an attitude loop's commanded rates: fed-forward rates + rotation to the wanted attitude / `lag`, (3,) [rad/s]."""
     # conj(q) * wanted, on the short way round.
     w = q[3] * wanted[3] + q[0] * wanted[0] + q[1] * wanted[1] + q[2] * wanted[2]
     x = q[3] * wanted[0] - q[0] * wanted[3] - q[1] * wanted[2] + q[2] * wanted[1]
@@ -75,17 +75,17 @@ def rates_of_attitude(q, wanted, rates, lag):
 
 @compiled
 def targets(w, speeds, rates, thrust, J, mixing, coefficient, low, high, motor_lag, lags, period):
-    """Speeds that the motors aim at, (4,) [rad/s].
+    """Return the target speeds of the motors, (4,) [rad/s].
 
     Args:
         w: body rates (3,) [rad/s].
-        speeds: of the rotors (4,) [rad/s].
-        rates, thrust: wanted (3,) [rad/s], collective [N].
+        speeds: rotor speeds (4,) [rad/s].
+        rates, thrust: wanted body rates (3,) [rad/s] and collective thrust [N].
         J: principal moments of inertia (3,) [kg m^2].
-        mixing, coefficient, low, high: of the rotors; speeds [rad/s].
+        mixing, coefficient, low, high: mixing matrix, thrust coefficient, least and greatest speed [rad/s] of the rotors.
         motor_lag: time constant of the rotors [s].
-        lags: of the rates and the thrust (4,) [s].
-        period: between two calls [s].
+        lags: time constants of the rates and the thrust (4,) [s].
+        period: interval between two calls [s].
     """
     moment = J * (rates - w) / lags[:3]
     for i in range(3):
@@ -101,10 +101,10 @@ def targets(w, speeds, rates, thrust, J, mixing, coefficient, low, high, motor_l
 
 
 class InnerLoop:
-    """Takes body rates, or attitudes, with thrust; says what the motors aim at.
+    """Converts body rates, or attitudes, and thrust to target speeds of the motors.
 
     Attributes:
-        watches: what happens when commands stop is its own business; not of this one.
+        watches: whether the loop itself handles commands that stop; this one leaves them to the motors' time-out.
     """
 
     watches = False
@@ -112,8 +112,8 @@ class InnerLoop:
     def __init__(self, vehicle: Vehicle, lag_factor: float = 1.0) -> None:
         """
         Args:
-            vehicle: its file, with the loop that it has.
-            lag_factor: how much slower the real loop is than the file says.
+            vehicle: vehicle with the parameters of its loop.
+            lag_factor: lags of the true loop / those of the vehicle's file.
         """
         a = vehicle.actuation
         self._delay, self._lags = round(a.delay * 1e9), lag_factor * np.array([*a.rate_lag, a.thrust_lag])
@@ -126,8 +126,8 @@ class InnerLoop:
         self._attitude: np.ndarray | None = None
 
     def command(self, now: int, armed: bool, rates: Sequence[float], thrust: float, attitude: Sequence[float] | None = None) -> None:
-        """Take a command at a time [ns]: body rates [rad/s], collective thrust / mass [m/s^2], attitude xyzw for an attitude loop; one
-        that is not armed ends all before it."""
+        """Accept a command at a time [ns]: body rates [rad/s], thrust / mass [m/s^2], attitude xyzw for an attitude loop.
+        A command that is not armed cancels all earlier ones."""
         if not armed:
             self._coming.clear()
             self._rates, self._attitude = np.zeros(4), None
@@ -136,13 +136,13 @@ class InnerLoop:
         self._coming.append((now + self._delay, values, None if attitude is None else np.array(attitude, float)))
 
     def speeds(self, now: int, x: np.ndarray, speeds: np.ndarray, sample: ImuSample | None = None) -> np.ndarray:
-        """What the motors aim at in the period that begins now [ns], (4,) [rad/s].
+        """Return the target speeds of the motors for the period that begins now, (4,) [rad/s].
 
         Args:
-            now: [ns].
+            now: simulation time [ns].
             x: true state (13,), see `dynamics`.
-            speeds: of the rotors (4,) [rad/s].
-            sample: what the IMU has read last; this loop knows the truth.
+            speeds: rotor speeds (4,) [rad/s].
+            sample: last sample of the IMU; not used, as this loop has the true state.
         """
         while self._coming and self._coming[0][0] <= now:
             _, self._rates, self._attitude = self._coming.popleft()
@@ -152,4 +152,4 @@ class InnerLoop:
         return targets(x[10:13], speeds, rates, self._gain[3] * self._rates[3], *self._rotors, self._lags, CONTROL_PERIOD)
 
     def close(self) -> None:
-        """It holds nothing."""
+        """Do nothing: the loop holds no resources."""

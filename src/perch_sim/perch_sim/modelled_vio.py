@@ -24,9 +24,9 @@ RATE_VARIANCE = 1e-4      # of each axis of the angular velocity [rad^2/s^2]
 
 
 class ModelledVio(Component[VioModelParameters]):
-    """One `vio/state` and one `vio/odometry` per frame of the camera, stamped with the middle of its exposure on the IMU's clock.
+    """Emits one `vio/state` and one `vio/odometry` per camera frame, stamped with the middle of its exposure on the IMU's clock.
 
-    It takes `camera_info` instead of images, so that it works with the cameras off.
+    Its input is `camera_info` instead of images, so that it works with the cameras off.
     """
 
     config_type = VioModelParameters
@@ -62,7 +62,7 @@ class ModelledVio(Component[VioModelParameters]):
         self._answers: deque[tuple[int, InertialState, OdometryState]] = deque(maxlen=MOST_FRAMES)  # (when it is due, ...)
 
     def on_truth(self, state: OdometryState) -> None:
-        """Take in a true state."""
+        """Store a true state, and answer the frames that it covers."""
         if not self._warned:
             self._warned = True
             self.warn("vio_model is a stand-in: vio/odometry is the truth with drift and noise")
@@ -76,7 +76,7 @@ class ModelledVio(Component[VioModelParameters]):
         self._emit()
 
     def on_camera_info(self, model: CameraModel) -> None:
-        """A frame, to be answered when the truth covers its exposure."""
+        """Record a frame, which is answered when the truth covers its exposure."""
         if not self._last_frame < model.stamp <= self._newest + LONGEST_AHEAD:
             self.warn(f"camera_{CAMERA}/camera_info: a stamp goes back or is ahead of the truth: not used", every=1.0)
             return
@@ -86,7 +86,7 @@ class ModelledVio(Component[VioModelParameters]):
         self._emit()
 
     def _answer(self) -> None:
-        """Answer every frame whose exposure the truth covers by now."""
+        """Compute the estimates of all frames whose exposure the truth covers."""
         while self._frames and self._frames[0] - self._offset <= self._newest:
             exposed = self._frames.popleft() - self._offset
             try:

@@ -1,4 +1,4 @@
-"""The motor controllers' side of a command: arming, limits, and stopping when commands cease."""
+"""Motor controllers: arming, limits of commands, and stop when commands cease."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ _SPEEDS = limits.LIMITS[MotorCommand]["rotor_speed"]
 
 
 class MotorCommandError(PerchError):
-    """A command that no motor controller would follow."""
+    """Raised when a command is refused."""
 
 
 class Motors:
-    """Holds the last good command and says what the rotors aim at.
+    """Holds the last valid command, and provides the target speeds of the rotors.
 
     Attributes:
-        timeout: armed motors stop when no good command came for so long [ns].
-        timed_out: they have.
-        starts: how often they were started after they had been stopped by command.
+        timeout: time without a valid command after which armed motors stop [ns].
+        timed_out: whether the motors have stopped for this reason.
+        starts: number of starts, except those directly after a time-out.
     """
 
     def __init__(self, speed_min: float, speed_max: float, timeout: int) -> None:
         """
         Args:
-            speed_min, speed_max: of an armed rotor [rad/s].
+            speed_min, speed_max: speed range of an armed rotor [rad/s].
             timeout: as above.
         """
         self._low, self._high, self.timeout = speed_min, speed_max, timeout
@@ -36,7 +36,7 @@ class Motors:
         self.timed_out, self.starts = False, 0
 
     def command(self, now: int, armed: bool, speeds: Sequence[float]) -> None:
-        """Take a command.
+        """Accept a command.
 
         Args:
             now: simulation time [ns].
@@ -44,7 +44,7 @@ class Motors:
             speeds: rotor speeds (4,) [rad/s], limited to the armed range.
 
         Raises:
-            MotorCommandError: a speed is nonsense, or there are not four; the command before it stays until it times out.
+            MotorCommandError: a speed is invalid, or there are not four; the previous command stays in effect until it times out.
         """
         values = [float(s) for s in speeds]
         if len(values) != 4:
@@ -57,13 +57,13 @@ class Motors:
             self._speeds = np.array([min(max(s, self._low), self._high) for s in values])
 
     def aim(self, speeds: np.ndarray, now: int | None = None) -> None:
-        """Speeds of an inner loop, within the armed range (4,) [rad/s]: they count as long as its last command does, or, with a time
-        [ns], from then on: a loop that watches over its commands itself."""
+        """Set the target speeds of an inner loop, within the armed range (4,) [rad/s]. They are valid as long as the last
+        command; a loop that handles the loss of commands itself passes the time [ns], which restarts the time-out."""
         self._speeds = speeds
         self._received = self._received if now is None else now
 
     def target(self, now: int) -> np.ndarray:
-        """Speeds that the rotors aim at, (4,) [rad/s]."""
+        """Return the target speeds of the rotors, (4,) [rad/s]; zero if the motors are stopped."""
         if self._armed and now - self._received > self.timeout:
             self._armed, self.timed_out = False, True
         return self._speeds if self._armed else np.zeros(4)

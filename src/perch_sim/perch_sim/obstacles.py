@@ -1,4 +1,4 @@
-"""What the vehicle can touch: floor, walls, ceiling and the panel with the pad, as rectangles with an outward normal."""
+"""Obstacles for the vehicle: floor, walls, ceiling and the panel with the pad, as rectangles with an outward normal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Obstacles(NamedTuple):
 
 
 def _axes(normal: np.ndarray) -> np.ndarray:
-    """A rotation whose third column is `normal`, (3, 3)."""
+    """Return a rotation whose third column is `normal`, (3, 3)."""
     helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
     s1 = np.cross(helper, normal)
     s1 /= np.linalg.norm(s1)
@@ -42,13 +42,13 @@ def _axes(normal: np.ndarray) -> np.ndarray:
 
 
 def pad_surface(scenario: Scenario, time: float) -> PerchSurface:
-    """The true pad at a time [s]."""
+    """Return the true pad at a time [s] since the start of the flight."""
     surface = scenario.surface
     return PerchSurface(surface.p_WS + np.array(scenario.target.velocity) * time, surface.R_WS, surface.size)
 
 
 def make_obstacles(scenario: Scenario) -> Obstacles:
-    """Floor, ceiling and walls of the room, and in surface scenarios the panel with its pad."""
+    """Return floor, ceiling and walls of the room, and in surface scenarios the panel with its pad."""
     length, width, height = scenario.world.room
     cx, cy = scenario.world.room_centre
     planes = [("floor", (cx, cy, 0.0), (0, 0, 1)), ("ceiling", (cx, cy, height), (0, 0, -1)),

@@ -1,4 +1,4 @@
-"""Real-time pacing: which steps are due by the wall clock, and which were missed."""
+"""Real-time pacing: number of steps that are due by the wall clock, and of those that were missed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ LONGEST_CATCH_UP = 25  # steps; a machine that was away for longer does not run 
 
 
 class Pacing:
-    """Steps against a clock. Pure: the caller says what time it is. Times in nanoseconds."""
+    """Paces periodic steps by a clock. Pure: times are arguments, in nanoseconds."""
 
     def __init__(self, period: int, now: int) -> None:
         self._period, self._epoch, self._done = period, now, 0
@@ -14,7 +14,7 @@ class Pacing:
         self.skipped = 0  # periods of wall-clock time given up
 
     def due(self, now: int) -> int:
-        """How many steps to do at the time `now`; the caller does them."""
+        """Return the number of steps that the caller is to execute at the time `now`."""
         behind = (now - self._epoch) // self._period - self._done
         if behind <= 0:
             return 0

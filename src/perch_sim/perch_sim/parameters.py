@@ -11,7 +11,7 @@ CAMERAS = {"all": ("down", "front"), "down": ("down",), "front": ("front",), "no
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleParameters:
-    """All are read once, at the start."""
+    """Parameters of the node `vehicle`; all are read once, at the start."""
 
     scenario: str = text("surface_90", doc="config/scenarios/<name>.yaml, or a file")
     vehicle: str = text("", doc="config/vehicles/<name>.yaml, or a file; empty: the scenario's")

@@ -1,4 +1,4 @@
-"""The vehicle's body in its world: one control period after the other, without sensors and without ROS."""
+"""Plant: rigid body, rotors, wind and contact, advanced by control periods; without sensors and without ROS."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STEP = CONTROL_PERIOD / SUBSTEPS
 
 
 class PlantOutput(NamedTuple):
-    """What happened in one period."""
+    """Output of one control period."""
 
     states: list[TrueState]        # at the end of each Runge-Kutta step, the last at the period's end
     inertial: np.ndarray           # mean specific force and angular velocity at the IMU in B, (6,)
@@ -33,7 +33,7 @@ class PlantOutput(NamedTuple):
 
 
 def resting_state(scenario: Scenario, body: Body) -> np.ndarray:
-    """The vehicle on the ground at the scenario's start, its plate's felt pressed by the weight, (13,)."""
+    """Return the state at rest on the ground at the scenario's start, the felt of the plate compressed by the weight, (13,)."""
     x = np.zeros(STATES)
     x[:3] = scenario.start.position
     x[2] += body.plate_offset - body.mass * GRAVITY / body.stiffness[:PLATE_POINTS].sum()
@@ -48,9 +48,9 @@ class Plant:
     def __init__(self, scenario: Scenario, vehicle: Vehicle, seed: int, start: int) -> None:
         """
         Args:
-            scenario: where it flies, and how the real vehicle differs from its file.
-            vehicle: the vehicle's file.
-            seed: of the gusts.
+            scenario: world of the flight, and differences of the true vehicle from its file.
+            vehicle: vehicle as its file describes it.
+            seed: seed of the flight, for the gusts.
             start: time of the initial state [ns].
         """
         self.body = make_body(vehicle, scenario.disturbance)
@@ -72,16 +72,16 @@ class Plant:
 
     @property
     def crashed(self) -> bool:
-        """Whether the rotors are broken."""
+        """Whether the vehicle has crashed; its motors then stop."""
         return self.contact.crashed or self.cables.crashed
 
     @property
     def hold(self) -> Hold:
-        """What holds the vehicle: the velcro, the gripper, or nothing."""
+        """Hold of the vehicle by the velcro or the gripper, or `FREE`."""
         return self.contact.hold if self.contact.attached else self.cables.hold
 
     def release(self) -> None:
-        """Velcro and gripper let go: a latch on the arming line of the motors opens them."""
+        """Release velcro and gripper, as a latch on the arming line of the motors does."""
         self.contact.release()
         self.cables.release()
 
@@ -92,15 +92,15 @@ class Plant:
 
     def place(self, p_WB: np.ndarray, q_WB: np.ndarray, v_WB: np.ndarray, w_WB_B: np.ndarray,
               rotor_speed: np.ndarray) -> None:
-        """Put the vehicle into a state: the start of a test or of a study that begins in the air."""
+        """Set the state of the vehicle, for tests and studies that begin in the air."""
         self._x = np.concatenate([p_WB, q_WB, v_WB, w_WB_B]).astype(float)
         self.rotor_speed = np.array(rotor_speed, float)
 
     def advance(self, target: np.ndarray) -> PlantOutput:
-        """One control period.
+        """Advance one control period.
 
         Args:
-            target: rotor speeds that the motors aim at (4,) [rad/s].
+            target: target speeds of the rotors (4,) [rad/s].
         """
         wind = self._wind.next()
         path, total, done, contacts = np.empty((SUBSTEPS, STATES)), np.zeros(6), 0, []
@@ -122,12 +122,12 @@ class Plant:
         return PlantOutput(states, total / SUBSTEPS, tuple(contacts))
 
     def _warm_up(self) -> None:
-        """Compile the kernels now, on a copy of the state, rather than in the first step of a flight in real time."""
+        """Compile the kernels on a copy of the state, so that the first step of a flight in real time is not delayed."""
         advance_to_touch(self._x.copy(), np.zeros(4), np.zeros(4), np.zeros(3), self.body, self.obstacles.surfaces, FREE,
                          0.0, STEP, np.empty((1, STATES)), np.zeros(6), self._touched)
 
     def _touches(self, time: int, before: np.ndarray) -> list[Contact]:
-        """Judge what is touched at a time [ns]; `before` is the state one step earlier."""
+        """Return the contact events at a time [ns]; `before` is the state one step earlier."""
         elapsed = (time - self._start) * 1e-9  # surfaces move since the start
         events = self.contact.update(elapsed, before, self._x, self._touched)
         return [event._replace(stamp=time) for event in events]

@@ -1,4 +1,4 @@
-"""What is flown: vehicle, place, target, disturbances, mission. One YAML file in `config/scenarios/` each."""
+"""Scenario of a flight: vehicle, world, target, disturbances, mission. Each is one YAML file in `config/scenarios/`."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ NODES = {
     "recorder": "perch_eval",
     "viewer": "perch_eval",
 }
-"""Node (which is also the name of its executable) -> package."""
+"""Node, also the name of its executable -> package."""
 MOST_CABLES = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Where the vehicle stands before the flight."""
+    """Pose of the vehicle on the ground before the flight."""
 
     position: Vector3 = quantity((0.0, 0.0, 0.0), unit="m", doc="ground point under the vehicle in map")
     yaw_deg: float = quantity(0.0, unit="deg", low=-180.0, high=180.0)
@@ -69,13 +69,13 @@ class Cable:
     colour: str = choice("red", options=("red", "grey"))
 
     def hanging(self) -> Catenary:
-        """How it truly hangs; a PerchError where it cannot."""
+        """Return the true catenary of the cable; raises PerchError if it has none."""
         return Catenary.from_sag(np.array(self.start), np.array(self.end), self.sag)
 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """The room and what hangs in it."""
+    """The room, its light and its cables."""
 
     room: Vector3 = quantity((10.0, 5.0, 4.0), unit="m", low=0.5, high=1000.0, doc="length, width, height")
     room_centre: tuple[float, float] = quantity((1.0, 0.0), unit="m", doc="x, y of the room's centre in map")
@@ -94,7 +94,7 @@ class Wind:
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """How the real vehicle differs from its file."""
+    """Differences of the true vehicle from its file."""
 
     mass_factor: float = quantity(1.0, low=0.5, high=2.0)
     inertia_factor: float = quantity(1.0, low=0.3, high=3.0)
@@ -107,7 +107,7 @@ class Disturbance:
 
 @dataclass(frozen=True, kw_only=True)
 class Adhesion:
-    """When the velcro holds. Facts of the material: never changed to make a run succeed."""
+    """Limits within which the velcro holds: properties of the material, never changed to make a run succeed."""
 
     normal_speed: tuple[float, float] = quantity((0.2, 1.0), unit="m/s", low=0.0)
     tangential_speed_max: float = quantity(0.6, unit="m/s", above=0.0)
@@ -117,7 +117,7 @@ class Adhesion:
 
 @dataclass(frozen=True, kw_only=True)
 class Grip:
-    """When the gripper holds a cable: pose and speed tolerances."""
+    """Tolerances of pose and speed within which the gripper holds a cable."""
 
     position: float = quantity(0.08, unit="m", above=0.0, doc="gripper to cable axis")
     tilt_deg: float = quantity(10.0, unit="deg", above=0.0)
@@ -127,7 +127,7 @@ class Grip:
 
 @dataclass(frozen=True, kw_only=True)
 class Latency:
-    """Modelled time from a slow participant's trigger to when its result counts [s] (on the paper's board VIO takes 35-45 ms)."""
+    """Modelled latency of slow participants, from trigger to use of the result [s] (VIO on the paper's board: 35-45 ms)."""
 
     vio: float = quantity(0.040, unit="s", low=0.002, high=1.0)
     target_localizer: float = quantity(0.060, unit="s", low=0.002, high=1.0)
@@ -152,7 +152,7 @@ class Mission:
 
 @dataclass(frozen=True, kw_only=True)
 class Waypoint:
-    """A place on the way of an inspection."""
+    """A waypoint of an inspection."""
 
     position: Vector3 = quantity(unit="m", doc="in map")
     yaw_deg: float = quantity(0.0, unit="deg", low=-180.0, high=180.0)
@@ -160,7 +160,7 @@ class Waypoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Inspection:
-    """The reference of an inspection: straight lines from waypoint to waypoint, at rest at each."""
+    """Reference of an inspection: straight lines from waypoint to waypoint, at rest at each."""
 
     waypoints: tuple[Waypoint, ...] = quantity(())
     speed: float = quantity(0.5, unit="m/s", above=0.0, high=5.0, doc="mean speed between waypoints")
@@ -169,7 +169,7 @@ class Inspection:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A flight that can be repeated from its file and a seed."""
+    """Description of a flight; together with a seed, it determines the flight."""
 
     name: str = label()
     description: str = text("")
@@ -261,7 +261,7 @@ class Scenario:
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
-    """The scenario of `config/scenarios/<name>.yaml`, or of a file, with all that it extends.
+    """Return the scenario of `config/scenarios/<name>.yaml`, or of a file, merged with the files that it extends.
 
     Raises:
         ConfigError: no such scenario, or a value that is refused.

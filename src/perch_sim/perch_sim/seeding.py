@@ -1,4 +1,4 @@
-"""One seed for a flight, and a stream of its own for everything that is random."""
+"""Random streams of a flight: one seed, and a separate stream for each random source."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """The random stream of one source (`imu`, `wind`, `camera_down` ...) of the flight `seed`.
+    """Return the random stream of one source (`imu`, `wind`, `noise_down` ...) of the flight `seed`.
 
-    Streams are spawned from the seed by name, so that none depends on which others exist: a camera that is switched
-    off does not change the IMU's noise.
+    Streams are spawned from the seed by name, so that none depends on which others exist: switching a camera off does
+    not change the IMU's noise.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),)))

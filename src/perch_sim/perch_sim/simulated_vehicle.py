@@ -1,4 +1,4 @@
-"""The simulated vehicle as a component: commands to its motors or its inner loop in; IMU, cameras, truth and contact out. It owns simulation time."""
+"""Component of the node `vehicle`: commands for motors or inner loop in; IMU, cameras, truth, contact and simulation time out."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ MakeDrawing = Callable[[Scenario, int, Collection[str]], Drawing]
 
 
 class SimulatedVehicle(Component[VehicleParameters]):
-    """Drives a `Simulation`: step by step where a schedule calls `advance`, by the host's time where `pace` is woken.
+    """Advances a `Simulation`: step by step if a schedule calls `advance`, by the host's time if the host calls `on_pace`.
 
     Attributes:
-        scenario: what is flown.
-        simulation: the vehicle.
-        time: stamp of the step that it has reached [ns].
+        scenario: scenario of the flight.
+        simulation: the simulated vehicle.
+        time: stamp of the last step [ns].
     """
 
     config_type = VehicleParameters
@@ -66,8 +66,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
         """
         Args:
             config: parameters.
-            scenario: what is flown; None: that which the parameters name.
-            drawing: where images are drawn, `DrawnInProcesses` or `DrawnOnDemand`.
+            scenario: scenario of the flight; None: the one that the parameters name.
+            drawing: renders images, `DrawnInProcesses` or `DrawnOnDemand`.
 
         Raises:
             ConfigError: the scenario, its vehicle or its board does not exist, or has a camera that is not simulated.
@@ -94,15 +94,15 @@ class SimulatedVehicle(Component[VehicleParameters]):
         self._counts = {"commands_missed": 0, "commands_refused": 0, "images_late": 0}
 
     def warm_up(self) -> None:
-        """OpenCV's threads would fight with those who fly for the processors."""
+        """Restrict OpenCV to one thread, as its threads would compete with the flight for the processors."""
         cv2.setNumThreads(1)
 
     def ready(self) -> bool:
-        """Whether images that are ordered now come without delay."""
+        """Return whether images can be rendered without a start-up delay."""
         return self._drawing is None or self._drawing.ready()
 
     def close(self) -> None:
-        """End the drawing processes, and what runs beside the simulation."""
+        """End the rendering processes and the inner loop's firmware, where there are any."""
         self.simulation.close()
         if self._drawing is not None:
             self._drawing.close()
@@ -110,19 +110,19 @@ class SimulatedVehicle(Component[VehicleParameters]):
     # -- inputs ------------------------------------------------------------------------------------------------------
 
     def on_motor_command(self, command: MotorCommand) -> None:
-        """Speeds that count from the next step on."""
+        """Set rotor speeds, which take effect in the next step."""
         self._take("rotor_speeds", command, command.rotor_speed)
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
-        """Body rates and thrust for the inner loop."""
+        """Pass body rates and thrust to the inner loop."""
         self._take("rates_and_thrust", command, command.w_B, command.thrust)
 
     def on_attitude_thrust(self, command: AttitudeThrust) -> None:
-        """Attitude and thrust for the inner loop."""
+        """Pass attitude and thrust to the inner loop."""
         self._take("attitude_and_thrust", command, command.w_B, command.thrust, command.q_WB)
 
     def _take(self, kind: str, command: MotorCommand | RatesThrust | AttitudeThrust, *content: Any) -> None:
-        """Hand a command to the motors or to the inner loop, or say why not."""
+        """Pass a command to the motors or to the inner loop; log a refused command and the reason."""
         simulation = self.simulation
         try:
             if kind != simulation.vehicle.actuation.type:
@@ -145,7 +145,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
     # -- going on ----------------------------------------------------------------------------------------------------
 
     def advance(self) -> list[Arrival]:
-        """One control period with the motors' present command, and all that it shows; images may still be being drawn.
+        """Advance one control period with the present command, and emit its outputs; images may not be rendered yet.
 
         Returns:
             Camera frames that have arrived.
@@ -158,7 +158,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
         return arrivals
 
     def on_pace(self, now: int) -> None:
-        """In real time: every period that the host's time [ns] has reached; images when they are drawn."""
+        """Advance all periods that the host's time [ns] has reached; emit images when they are rendered."""
         if self._pacing is None:
             self._pacing = Pacing(CONTROL_PERIOD_NS, now)
             self.simulation.motors.timeout = REAL_TIME_MOTOR_TIMEOUT
@@ -218,7 +218,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
                               "is not one of down, front, which are simulated") from None
 
     def _show(self, name: str, delivery: Delivery) -> Arrival:
-        """Emit a frame: its model, and its image where one was taken."""
+        """Emit a frame: its camera model, and its image if there is one."""
         stream, frame, coming = self.simulation.cameras[name], delivery.frame, delivery.image
         if stream.broken and name not in self._broken:
             self._broken.add(name)
@@ -235,7 +235,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
     # -- people ------------------------------------------------------------------------------------------------------
 
     def diagnose(self) -> None:
-        """How the vehicle is."""
+        """Emit diagnostics; warn if too many commands are missed."""
         self._diagnosed = self.time
         simulation = self.simulation
         values = {"time_s": self.time * 1e-9, "steps": self._index, **self._counts, "motors_timed_out": simulation.motors.timed_out,
@@ -257,7 +257,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
 
 
 def true_odometry(state: TrueState) -> OdometryState:
-    """A true state as odometry."""
+    """Return a true state as odometry."""
     x = state.x.tolist()
     q = tuple(x[3:7])
     return OdometryState(state.time, tuple(x[0:3]), q, rotated(q, x[7:10], -1.0), tuple(x[10:13]), EXACT, EXACT)

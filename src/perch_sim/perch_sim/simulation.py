@@ -1,7 +1,7 @@
 """The simulated vehicle without ROS: plant, motors, IMU and camera times of a scenario and a seed.
 
-The same scenario, seed and commands give the same flight, bit by bit. The vehicle node drives it in lockstep or in
-real time; tests and studies can drive it with any controller in a loop:
+The same scenario, seed and commands give the same flight, bit by bit. The vehicle node advances it in lockstep or in
+real time; tests and studies can advance it with any controller in a loop:
 
     flight = Simulation(load_scenario("surface_90"), seed=1)
     while flight.time < 5 * NANOSECONDS:
@@ -41,7 +41,7 @@ MOTOR_TIMEOUT = 100_000_000  # a motor controller stops without commands for so 
 
 
 class Output(NamedTuple):
-    """One control period of the vehicle."""
+    """Output of one control period."""
 
     time: int                           # end of the period [ns]
     imu: ImuSample
@@ -50,14 +50,14 @@ class Output(NamedTuple):
 
 
 class Simulation:
-    """A vehicle in flight. `time` [ns] is the IMU's clock."""
+    """A vehicle in flight. All times are on the IMU's clock [ns]."""
 
     def __init__(self, scenario: Scenario, seed: int, drawing: Drawing | None = None) -> None:
         """
         Args:
-            scenario: what is flown.
-            seed: of everything that is random.
-            drawing: of the cameras that take images; the others keep only their times.
+            scenario: scenario of the flight.
+            seed: seed of all random streams.
+            drawing: renders the images of some cameras; of the others, only the frame times are simulated.
 
         Raises:
             ConfigError: the scenario's vehicle or board does not exist, or its IMU does not run at the control rate.
@@ -98,11 +98,11 @@ class Simulation:
 
     @property
     def pad(self) -> PerchSurface:
-        """The true pad at this time."""
+        """The true pad at the present time."""
         return pad_surface(self.scenario, (self.time - START) * 1e-9)
 
     def advance(self) -> Output:
-        """One control period with the motors' present command; what holds the vehicle lets go when they are started."""
+        """Advance one control period with the present command; starting the motors releases velcro and gripper."""
         if self.motors.starts != self._starts:
             self._starts = self.motors.starts
             self.plant.release()
@@ -118,6 +118,6 @@ class Simulation:
         return Output(self.time, self._sample, result.states[-1], result.contacts)
 
     def close(self) -> None:
-        """End what runs beside it."""
+        """End the inner loop's firmware, if there is one."""
         if self.loop is not None:
             self.loop.close()

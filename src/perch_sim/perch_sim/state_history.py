@@ -1,4 +1,4 @@
-"""The true trajectory of the last moments, to be asked for any time in between: exposures end between two steps."""
+"""Recent true trajectory, interpolated at any time in its span: exposures begin and end between two steps."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class TrueState(NamedTuple):
 
 
 Place = tuple[TrueState, TrueState, float]
-"""Two states and the share of the way from one to the other."""
+"""Two successive states, and the interpolation parameter 0..1 between them."""
 
 
 class StateHistory:
-    """States at increasing times, as far back as a camera can ask."""
+    """States at increasing times, as far back as an exposure can reach."""
 
     def __init__(self, length: int) -> None:
         self._states: deque[TrueState] = deque(maxlen=length)
@@ -53,7 +53,7 @@ class StateHistory:
         self._states.append(state)
 
     def at(self, time: int) -> TrueState:
-        """State at a time [ns]: cubic Hermite in position, slerp in attitude.
+        """Return the state at a time [ns]: cubic Hermite in position, slerp in attitude, linear in velocities.
 
         Raises:
             LookupError: the time lies outside the history.
@@ -63,7 +63,7 @@ class StateHistory:
         return TrueState(time, np.concatenate([p[0], q[0], a.x[7:] + s * (b.x[7:] - a.x[7:])]))
 
     def around(self, time: int) -> Place:
-        """The states before and after a time [ns], and the share of the way from one to the other.
+        """Return the states before and after a time [ns], and the interpolation parameter 0..1 between them.
 
         Raises:
             LookupError: the time lies outside the history.
@@ -82,7 +82,7 @@ class StateHistory:
 
 
 def between(places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (n, 3) and attitudes (n, 4) at shares of the way between states."""
+    """Return the positions (n, 3) and attitudes (n, 4) that are interpolated between states."""
     # The weights in plain floats: the same bits for one time and for many.
     weights = np.array([((1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s), (b.time - a.time) * 1e-9 * s * (1 - s), 1 - s, s)
                         for a, b, s in places]).T[..., None]

@@ -1,14 +1,14 @@
 """A stand-in for visual-inertial odometry: the truth with drift and noise. It is NOT an estimator.
 
-It exists so that the rest of the stack can be tried without images; flights that count use `perch_perception vio`.
+It serves to run the rest of the stack without images; flights that are evaluated use `perch_perception vio`.
 
-Error model, per pose: position and yaw drift as random walks, roll and pitch do not drift (gravity shows them); on top
-comes white noise on position, attitude and velocity. A filter's pose is smooth: from frame to frame it jumps by a
-millimetre or two, while its drift grows to a centimetre within a flight. The covariance that goes with a pose is the
-white part plus what the drift has grown to.
+Error model, per pose: position and yaw drift as random walks; roll and pitch do not drift, as gravity makes them observable.
+White noise is added to position, attitude and velocity. A filter's pose is smooth: from frame to frame it jumps by a
+millimetre or two, while its drift grows to a centimetre within a flight. The covariance of a pose is that of the white
+noise plus that of the drift so far.
 
-A VIO knows its biases, too: once it has started, each of its estimates is off by a constant error of a known size, while the truth
-walks away from what it was at turn-on.
+A VIO estimates the biases of the IMU, too: each estimate has a constant error of known standard deviation, while the true bias
+walks away from its value at turn-on.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class VioModelParameters:
 
 
 class VioEstimate(NamedTuple):
-    """A degraded pose; frames as in nav_msgs/Odometry."""
+    """A degraded pose and velocity, both in W."""
 
     p_WB: np.ndarray        # (3,) [m]
     q_WB: np.ndarray        # xyzw, (4,)
@@ -54,7 +54,7 @@ class VioEstimate(NamedTuple):
 
 
 class VioModel:
-    """Owns the drift; each call makes the next pose of one flight."""
+    """Degrades the true poses of one flight in order; owns the drift."""
 
     def __init__(self, params: VioModelParameters, rng: np.random.Generator) -> None:
         self._params, self._rng = params, rng
@@ -63,11 +63,11 @@ class VioModel:
         self._last: float | None = None
 
     def degrade(self, time: float, p_WB: np.ndarray, q_WB: np.ndarray, v_WB: np.ndarray) -> VioEstimate:
-        """The pose that a VIO might have found.
+        """Return a pose such as a VIO would estimate.
 
         Args:
-            time: of the pose [s], later than that of the call before.
-            p_WB, q_WB, v_WB: the truth [m, xyzw, m/s].
+            time: time of the pose [s], later than that of the previous call.
+            p_WB, q_WB, v_WB: true pose and velocity [m, xyzw, m/s].
         """
         k, draw = self._params, self._rng.standard_normal(13)
         root = 0.0 if self._last is None else math.sqrt(max(0.0, time - self._last))
@@ -90,19 +90,19 @@ class VioModel:
 
 
 class BiasModel:
-    """What a VIO would have found the biases to be."""
+    """Model of the IMU biases that a VIO would estimate."""
 
     def __init__(self, imu: ImuConfig, turn_on: np.ndarray, rng: np.random.Generator) -> None:
         """
         Args:
-            imu: how far the truth walks.
-            turn_on: true biases as the flight began, gyro [rad/s] and accelerometer [m/s^2], (6,).
-            rng: draws the errors.
+            imu: provides the random walk of the true biases.
+            turn_on: true biases at the start of the flight, gyro [rad/s] and accelerometer [m/s^2], (6,).
+            rng: random stream of the errors.
         """
         sigma = np.repeat([GYRO_BIAS_ERROR, ACCEL_BIAS_ERROR], 3)
         self._estimate = turn_on + sigma * rng.standard_normal(6)
         self._variance, self._walk = sigma**2, np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) ** 2
 
     def at(self, age: float) -> tuple[np.ndarray, np.ndarray]:
-        """The estimates and their variances, (6,) each, so long [s] after the start."""
+        """Return the estimates and their variances, (6,) each, at a time [s] after the start."""
         return self._estimate, self._variance + self._walk * age

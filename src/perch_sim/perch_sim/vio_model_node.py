@@ -1,4 +1,4 @@
-"""Node `vio_model`: `ros2 run perch_sim vio_model`. A stand-in for VIO, made from the truth."""
+"""Node `vio_model`: `ros2 run perch_sim vio_model`. A stand-in for VIO that degrades the truth."""
 
 from perch_core.interrupts import quiet_on_interrupt
 

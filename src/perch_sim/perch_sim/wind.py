@@ -14,7 +14,7 @@ LEAST_AIRSPEED = 1.0  # speed at which gusts pass when there is no steady wind [
 
 
 def dryden(sigma: float, length: float, airspeed: float) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
-    """Dryden's shaping filters as (A, B, C) with white noise of unit density at the input (MIL-F-8785C).
+    """Return Dryden's shaping filters as (A, B, C) with white noise of unit density at the input (MIL-F-8785C).
 
     Along the wind: sigma sqrt(2T) / (1 + T s). Across it: sigma sqrt(T) (1 + sqrt(3) T s) / (1 + T s)^2, T = L / V.
 
@@ -58,7 +58,7 @@ class WindField:
         Args:
             wind: steady wind and strength of the gusts.
             step: time between calls of `next` [s].
-            rng: the wind's own stream.
+            rng: random stream of the wind.
         """
         self._steady = np.array(wind.steady, float)
         speed = float(np.hypot(self._steady[0], self._steady[1]))
@@ -70,7 +70,7 @@ class WindField:
                           for part in dryden(wind.gust_sigma, LENGTH, max(speed, LEAST_AIRSPEED))])
 
     def next(self) -> np.ndarray:
-        """Air velocity in W over the next step, (3,) [m/s]."""
+        """Return the air velocity in W over the next step, (3,) [m/s]."""
         if not self._filters:
             return self._steady
         return self._steady + self._axes @ np.array([f.next() for f in self._filters])

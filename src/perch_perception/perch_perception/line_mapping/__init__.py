@@ -1,4 +1,4 @@
-"""Powerlines from colour images: wires detected, associated and triangulated with the poses of their exposures."""
+"""Powerlines from images: wires are detected, associated and triangulated with the poses of their exposures."""
 
 from perch_perception.line_mapping.backdrop import Backdrop
 from perch_perception.line_mapping.curve import WireCurve

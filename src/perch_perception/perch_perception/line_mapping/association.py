@@ -1,4 +1,4 @@
-"""Which sighting belongs to which wire."""
+"""Association of sightings with wires."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REACH = 1.5  # how far a wire may go on beyond what was seen [m]
 
 
 class Track(Protocol):
-    """What is needed of a wire that is being followed."""
+    """Attributes of a tracked wire that the association requires."""
 
     estimate: WireEstimate | None
     last: LineObservation
@@ -29,7 +29,7 @@ class Track(Protocol):
 
 
 def score(track: Track, seen: LineObservation) -> float:
-    """Misfit of a sighting to a wire in units of the gate; inf where it cannot be the same."""
+    """Return the misfit of a sighting to a wire in units of the gate; inf where they cannot match."""
     if not _as_wide(track, seen):
         return np.inf
     if track.estimate is not None:
@@ -55,7 +55,7 @@ def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, se
 
 
 def _score_followed(last: LineObservation, seen: LineObservation) -> float:
-    """Angle by which a sighting left the plane of the last one [rad]: parallax only, as rays are in W."""
+    """Return the angle by which a sighting leaves the plane of the last one [rad]: parallax only, as rays are in W."""
     normal = last.normal
     offset = float(np.sqrt(np.mean((seen.rays_W @ normal) ** 2)))
     turned = float(np.arccos(np.clip(abs(seen.normal @ normal), 0.0, 1.0)))
@@ -69,7 +69,7 @@ def _score_followed(last: LineObservation, seen: LineObservation) -> float:
 
 
 def _as_wide(track: Track, seen: LineObservation) -> bool:
-    """Whether a sighting looks about as wide as a wire does, or did in its last image; those too thin to be measured look alike."""
+    """Whether a sighting is about as wide as the wire should appear, or was in its last image; unmeasurable widths match."""
     width = track.last.width if track.estimate is None else track.estimate.width_from(seen.p_WC)
     if np.isnan(width):  # nothing is known of its radius
         return True
@@ -78,16 +78,16 @@ def _as_wide(track: Track, seen: LineObservation) -> bool:
 
 
 def _thin(seen: LineObservation) -> float:
-    """Width of the thinnest wire that can be measured [rad]."""
+    """Return the width of the thinnest wire that can be measured [rad]."""
     return LEAST_WIDTH / SIGMA * seen.sigma
 
 
 def meets_another(tracks: Sequence[Track], owner: Track, seen: LineObservation) -> bool:
-    """Whether another mapped wire may stick out beside the one that was seen: its width is then that of both.
+    """Whether another mapped wire may appear beside the observed one, so that the measured width is that of both.
 
     Args:
         tracks: all wires.
-        owner: the wire that was seen.
+        owner: the observed wire.
         seen: the sighting.
     """
     own = owner.estimate
@@ -113,9 +113,9 @@ def meets_another(tracks: Sequence[Track], owner: Track, seen: LineObservation) 
 
 
 def associate(tracks: Sequence[Track], seen: Sequence[LineObservation]) -> list[int | None]:
-    """For each sighting the index of its wire, -1 for a new one, or None where it could be one of several.
+    """Return for each sighting the index of its wire, -1 for a new wire, or None where it could be one of several.
 
-    A triangulated wire may be seen in several pieces at once; one that is only followed, in one.
+    A triangulated wire may have several sightings in one image; a wire that is not triangulated yet has at most one.
     """
     scores = np.array([[score(track, one) for track in tracks] for one in seen]).reshape(len(seen), len(tracks))
     answer: list[int | None] = [-1] * len(seen)

@@ -1,8 +1,8 @@
-"""What is behind a wire moves otherwise than the wire does: a kerb, a road mark or a seam of a wall moves with what is beside it.
+"""Check whether a line is a free wire: the background moves relative to a wire, but with a kerb, a road mark or a seam of a wall.
 
-Between two images the surroundings of a sighting shift by what their distance says. With i the inverse distance of what is beside
-the wire, as a share of the wire's, its pixels shift from where they were if infinitely far (i = 0) towards where they were if at the
-wire's distance (i = 1): the optical flow beside the wire measures i.
+Between two images the surroundings of a sighting shift according to their distance. Let i be their inverse distance, as a share
+of the wire's. Their pixels shift from those for an infinite distance (i = 0) towards those for the wire's distance (i = 1): the
+optical flow beside the wire measures i.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class _View:
     R_WC: np.ndarray
 
     def project(self, camera: Camera, points_W: np.ndarray) -> np.ndarray:
-        """Pixels of points (n, 3), NaN beyond the lens."""
+        """Return the pixels of points (n, 3); NaN outside of the lens's image."""
         return camera.project((points_W - self.p_WC) @ self.R_WC)[0]
 
 
 class Backdrop:
-    """Compares each image with one from some centimetres before."""
+    """Compares each image with one taken some centimetres before."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -48,18 +48,18 @@ class Backdrop:
         self._now: _View | None = None
 
     def look(self, grey: np.ndarray, time: float, p_WC: np.ndarray, R_WC: np.ndarray) -> None:
-        """Take the next image, mono8, its time [s] and its camera's pose."""
+        """Add the next image, mono8, its time [s] and its camera's pose."""
         if self._now is not None and (self._before is None or time - self._before.time > OLDEST
                                       or np.linalg.norm(p_WC - self._before.p_WC) > BASELINE):
             self._before = self._now
         self._now = _View(grey, time, np.array(p_WC), np.array(R_WC))
 
     def attached(self, seen: LineObservation, curve: WireCurve) -> bool | None:
-        """Whether a sighting in the last image lies on what is beside it; None where the motion does not tell.
+        """Whether a sighting in the last image lies on the surface beside it; None where the motion does not decide this.
 
         Args:
             seen: the sighting, with the last image's pose.
-            curve: the wire, which says how far away it is.
+            curve: the wire, which gives its distance.
         """
         now, before, camera = self._now, self._before, self._camera
         if now is None or before is None:
@@ -90,7 +90,7 @@ class Backdrop:
 
     @staticmethod
     def _flow(a: np.ndarray, b: np.ndarray, places: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where places (n, 2) of image a are in image b, and which were found."""
+        """Track points (n, 2) of image `a` into image `b`; return their pixels and which were found."""
         found, status, _ = cv2.calcOpticalFlowPyrLK(a, b, places.astype(np.float32)[:, None], guess.astype(np.float32)[:, None].copy(),
                                                     winSize=(WINDOW, WINDOW), maxLevel=2, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
         return found[:, 0].astype(float), status.ravel() > 0

@@ -1,6 +1,6 @@
-"""The middle of a plain wire: between its two edges, in the mean of many profiles across it.
+"""Centre line of a plain wire: the middle between its two edges, in the mean of many profiles across it.
 
-Ridge points of a thick wire come from its whole width and from its rims alike, and lie half a pixel about its middle.
+Ridge points of a thick wire arise on its whole width and on its rims alike, and scatter by half a pixel about its middle.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ FARTHEST = 3.0     # of the middle from the ridge points' mean, at its level [px
 
 
 def centred(grey: np.ndarray, camera: Camera, rays_C: np.ndarray, bright: bool, level: float) -> np.ndarray:
-    """Rays to the middle of a wire.
+    """Return rays to the middle of a wire.
 
     Args:
         grey: uint8, shape (height, width).
         camera: its lens.
         rays_C: unit rays near the wire's axis, in order along it, shape (n, 3).
-        bright: brighter than what is behind it.
-        level: of the image pyramid in which it is one to four pixels wide.
+        bright: whether the wire is brighter than its background.
+        level: level of the image pyramid in which the wire is one to four pixels wide.
 
     Returns:
-        Unit rays, shape (n, 3); one keeps its place where no two edges are found.
+        Unit rays, shape (n, 3); a ray is unchanged where no two edges are found.
     """
     scale = 2.0**level
     pixels = camera.project(rays_C)[0]

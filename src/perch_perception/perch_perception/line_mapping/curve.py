@@ -1,4 +1,4 @@
-"""The shape of a hanging wire near a point: a straight line with a little sag.
+"""Shape of a hanging wire near a point: a straight line with a little sag.
 
 A catenary is, over a few metres, a parabola in the vertical plane: X(s) = p + s d + kappa/2 s^2 u, with u the upward
 normal to d. kappa is w/H, weight per length over tension; a taut wire has kappa = 0.
@@ -51,7 +51,7 @@ class WireCurve:
         return self.direction + self.curvature * np.asarray(s, float)[..., None] * self.axes[:, 1]
 
     def moved(self, step: np.ndarray) -> WireCurve:
-        """The curve after a change of its five parameters."""
+        """Return the curve after a change of its five parameters."""
         axes = self.axes
         turn = so3.exp(np.cross(self.direction, axes[:, :2] @ step[2:4]))
         direction = turn @ self.direction
@@ -59,7 +59,7 @@ class WireCurve:
                          self.curvature + float(step[4]))
 
     def nearest(self, centres: np.ndarray, rays: np.ndarray) -> np.ndarray:
-        """s of the points that pass nearest to rays, with two Newton-like corrections for the sag.
+        """Return s of the wire's points that are nearest to rays, with two Newton-like corrections for the sag.
 
         Args:
             centres: origins of the rays [m], shape (n, 3).
@@ -74,11 +74,11 @@ class WireCurve:
         return s
 
     def offsets(self, centres: np.ndarray, rays: np.ndarray) -> Offsets:
-        """How far rays pass by the wire, and what that depends on.
+        """Return the angles by which rays miss the wire, with derivatives.
 
         The plane through a ray's origin c and the tangent T at the nearest point P has the normal N = (P - c) x T; the offset
-        is the ray's angle to it, r . N / |N|, whose derivative is r' . dN / |N| with r' the ray's part in the plane. s does not
-        matter to first order.
+        is the ray's angle to it, r . N / |N|, whose derivative is r' . dN / |N| with r' the ray's part in the plane. s has no
+        effect to first order.
 
         Args:
             centres: origins of the rays [m], shape (n, 3).
@@ -102,13 +102,13 @@ class WireCurve:
 
 @dataclass(frozen=True)
 class Offsets:
-    """Rays against a wire.
+    """Offsets of rays from a wire.
 
     Attributes:
         angles: signed angles by which the rays pass the wire [rad], shape (n,).
         normals: unit normals of the planes through the rays' origins and the wire, shape (n, 3).
         jacobian: derivative of the angles by the wire's five parameters, shape (n, 5).
-        ahead: how far along each ray the wire is [m], shape (n,); negative: behind its origin.
+        ahead: distance of the wire along each ray [m], shape (n,); negative: behind the ray's origin.
         s: the nearest points of the wire [m], shape (n,).
     """
 

@@ -1,9 +1,9 @@
-"""Wires in an image: arcs on the sphere of rays.
+"""Detection of wires in an image as arcs on the sphere of rays.
 
-A straight wire is seen as a plane through the optical centre, under any lens; one that sags, as an arc near a plane. So
-pixels of redness R - max(G, B) become ridge points across each blob, these become rays, and parabolas about the blob's
-plane are fitted to them. The threshold on redness gives no false segments on a textured background, where a line
-detector on the red channel gave thousands. Wires without a colour are ridges that run straight through the image (see `straight`).
+A straight wire is seen as a plane through the optical centre, under any lens; one that sags, as an arc near a plane. Each blob of
+pixels with high redness R - max(G, B) is therefore reduced to ridge points, these are converted to rays, and parabolas about the
+blob's plane are fitted to them. The threshold on redness gives no false segments on a textured background, where a line detector
+on the red channel gave thousands. Wires without a colour are ridges that run straight through the image (see `straight`).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MEETING, MEETING_AT, MEETING_OVER = 0.4, 3.25, 1.1
 
 @dataclass(frozen=True)
 class LineDetectionConfig:
-    """What counts as a wire in the image."""
+    """Settings of the wire detection."""
 
     appearance: str = config.choice("red", options=("red", "plain"),
                                     doc="red: redder than everything else; plain: brighter or darker than what is behind it")
@@ -70,12 +70,12 @@ def redness(image: np.ndarray) -> np.ndarray:
 
 
 def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfig) -> list[LineSighting]:
-    """Wires in an image, the longest first.
+    """Return the wires in an image, the longest first.
 
     Args:
         image: rgb8, shape (height, width, 3); for plain wires mono8, shape (height, width), too.
         camera: its lens.
-        settings: what counts as a wire.
+        settings: criteria for a wire.
     """
     if settings.appearance == "plain":
         return _plain(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), camera)
@@ -97,7 +97,7 @@ def detect_lines(image: np.ndarray, camera: Camera, settings: LineDetectionConfi
 
 
 def _plain(grey: np.ndarray, camera: Camera) -> list[LineSighting]:
-    """Wires that have no colour of their own; their widths are not measured."""
+    """Return the wires without a distinctive colour; their widths are not measured."""
     found = ridges(grey)
     rays, edges = camera.unproject(found.pixels), np.full((len(found.pixels), 2, 2), np.nan)
     arcs = wires(found, camera, TOLERANCE, PLAIN_LENGTH)
@@ -113,7 +113,7 @@ def ridge_points(blob: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.n
 
     Args:
         blob: weights, 0 outside the blob, shape (h, w).
-        around: weights of the blob and what is around it, nan beyond the image, shape (h + 2 EDGE_REACH, w + 2 EDGE_REACH).
+        around: weights of the blob and its surroundings, nan beyond the image, shape (h + 2 EDGE_REACH, w + 2 EDGE_REACH).
 
     Returns:
         Pixels (n, 2), and where the runs begin and end (n, 2, 2), nan where that is beyond the image.
@@ -135,7 +135,7 @@ def ridge_points(blob: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _edges(around: np.ndarray, column: np.ndarray, first: np.ndarray, last: np.ndarray) -> list[np.ndarray]:
-    """Where runs begin and end: at the steepest places, which neither blur nor shading moves; (n,) each."""
+    """Return where runs begin and end, (n,) each: at the steepest places, which neither blur nor shading moves."""
     steps = np.diff(around, axis=0)  # from row k - EDGE_REACH to the next: at k - EDGE_REACH + 1/2
     found, run = [], np.arange(len(column))
     for sign, outside in ((1.0, first - 2), (-1.0, last - EDGE_REACH)):
@@ -149,7 +149,7 @@ def _edges(around: np.ndarray, column: np.ndarray, first: np.ndarray, last: np.n
 
 
 def _arcs(pixels, edges, camera) -> list[LineSighting]:
-    """Arcs through the ridge points of one blob, the best first, each split where it has holes."""
+    """Return the arcs through the ridge points of one blob, the best first, each split where it has gaps."""
     rays = camera.unproject(pixels)
     seen = np.all(np.isfinite(rays), axis=1) & np.all(np.isfinite(edges), axis=(1, 2))  # the middle of what the image cuts off is not the wire's
     pixels, edges, rays = pixels[seen], edges[seen], rays[seen]
@@ -233,8 +233,8 @@ def _sighting(piece, pixels, edges, rays, spread, camera) -> LineSighting:
 def _width(edges: np.ndarray, camera: Camera) -> float:
     """Angle between the planes that touch a wire on both sides [rad], from its edges in the image (n, 2, 2).
 
-    Seen askew the wire's direction is not that of its image, so the planes are fitted each to its side. 0 where the edges are not
-    known (nan), or the wire is too thin to tell.
+    In an oblique view the wire's direction differs from that of its image, so a plane is fitted to each side. 0 where an edge is
+    unknown (nan), or the wire is too thin to be measured.
     """
     if np.isnan(edges).any():
         return 0.0

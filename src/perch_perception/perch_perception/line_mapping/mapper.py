@@ -1,4 +1,4 @@
-"""The map of wires: sightings come in with the poses of their exposures, segments with covariance come out."""
+"""Map of wires: sightings with the poses of their exposures in, segments with covariance out."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
 
 @dataclass(frozen=True)
 class MapperConfig:
-    """What is kept and published."""
+    """Settings of the mapper."""
 
     max_sigma: float = config.quantity(0.15, unit="m", above=0.0, high=5.0, doc="wires known worse than this are not published")
     triangulation: TriangulationConfig = config.part(TriangulationConfig)
@@ -51,10 +51,10 @@ class _Track:
 
 
 class LineMapper:
-    """Follows, triangulates and keeps wires. The state is the list of wires.
+    """Tracks, triangulates and stores wires. The state is the list of wires.
 
-    They are kept in a frame that leaves out what the odometry corrects its position by: the vehicle does not move by that, and neither
-    does the wire as the vehicle sees it. The map is given in W as the odometry has it now.
+    Wires are stored in a frame without the odometry's position corrections: these move neither the vehicle nor the wire relative
+    to the vehicle. The map is published in the odometry's present W.
     """
 
     def __init__(self, settings: MapperConfig | None = None) -> None:
@@ -66,13 +66,14 @@ class LineMapper:
 
     def update(self, time: float, body: BodyState, seen: Sequence[LineObservation],
                attached: Callable[[LineObservation, WireCurve], bool | None] | None = None) -> PowerlineMap:
-        """Take the sightings of one image.
+        """Update the map with the sightings of one image.
 
         Args:
             time: of the exposure [s].
-            body: state of the body then; the covariance of its attitude is the odometry's share of the map's.
+            body: state of the body at that time; the covariance of its attitude is the odometry's share of the map's.
             seen: the sightings, placed with this state.
-            attached: says of a sighting and its wire (both without what the odometry corrected) whether it lies on what is beside it.
+            attached: returns whether a sighting of a wire (both without the odometry's corrections) lies on the surface beside
+                it; None: undecided.
         """
         self._corrected = body.corrected
         self._body = replace(body, p_WB=body.p_WB - body.corrected)
@@ -99,7 +100,7 @@ class LineMapper:
 
     def _judge(self, seen: Sequence[LineObservation], owners: Sequence[int | None],
                attached: Callable[[LineObservation, WireCurve], bool | None]) -> None:
-        """Count for each wire that was seen whether it is attached to what is beside it."""
+        """Count for each observed wire the images that show it attached to the surface beside it, less those that do not."""
         for one, owner in zip(seen, owners):
             if owner is None or owner < 0:
                 continue
@@ -109,7 +110,7 @@ class LineMapper:
                 track.attached += 0 if verdict is None else 1 if verdict else -1
 
     def map(self, time: float) -> PowerlineMap:
-        """The map at the time of the last image [s]: its lines by id."""
+        """Return the map at the time of the last image [s], its lines sorted by id."""
         lines: list[MappedPowerline] = []
         missing: list[str] = []
         for track in self._tracks:
@@ -122,7 +123,7 @@ class LineMapper:
         return PowerlineMap(nanoseconds(time), tuple(sorted(lines, key=lambda line: line.id)), bool(missing), "; ".join(missing))
 
     def _extend(self, track: _Track, one: LineObservation) -> bool:
-        """Add a sighting; False where it is from the same place as the last and adds nothing."""
+        """Add a sighting; return False where it is from the same place as the last and is not kept."""
         before = track.observations[-1]
         track.last = one
         track.count += 1
@@ -145,7 +146,7 @@ class LineMapper:
         track.extent = self._extent(track.observations, track.estimate)
 
     def _extent(self, observations: Sequence[LineObservation], estimate: WireEstimate) -> tuple[float, float] | None:
-        """Range of s that was seen at least twice."""
+        """Return the range of s that was seen at least twice; None where there is none."""
         curve = estimate.curve
         used = [one for one, good in zip(observations, estimate.used) if good]
         centres = np.repeat([one.p_WC for one in used], 2, axis=0)
@@ -162,7 +163,7 @@ class LineMapper:
         return (low, high) if high - low > 0.1 else None
 
     def _merge(self) -> None:
-        """Make one of two wires that turned out to be the same: the older keeps its id."""
+        """Merge wires that turned out to be the same; the older one keeps its id."""
         kept: list[_Track] = []
         for track in self._tracks:
             twin = next((other for other in kept if _same_wire(other, track)), None)
@@ -178,9 +179,9 @@ class LineMapper:
         self._tracks = kept
 
     def _supersede(self, time: float) -> None:
-        """Drop wires that are no longer where they were: the odometry was corrected, and they are seen anew beside there.
+        """Drop stale wires that a fresh wire beside them replaces, for example after a correction of the odometry.
 
-        What was seen before a wire went out of view is another wire beside it.
+        A wire that was seen before the stale one went out of view is a different wire, and does not replace it.
         """
         fresh = [t for t in self._tracks if t.estimate is not None and t.extent is not None and t.count >= MIN_OBSERVATIONS
                  and time - t.last.time <= STALE_AFTER]
@@ -188,7 +189,7 @@ class LineMapper:
                         or not any(other.observations[0].time > t.last.time and _beside(t, other, SUPERSEDED) for other in fresh)]
 
     def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedPowerline]:
-        """The wire as chords that stay within `STRAIGHTNESS`; none where it is not known well enough."""
+        """Return the wire as chords that stay within `STRAIGHTNESS`; none, with the reason in `missing`, if too uncertain."""
         if track.extent is None:
             missing.append(f"line {track.id}: its ends were not seen yet")
             return []
@@ -212,9 +213,9 @@ class LineMapper:
         return lines
 
     def _covariance(self, estimate: WireEstimate, s: float) -> np.ndarray:
-        """Of the point at s relative to the vehicle, from the sightings and the attitude, shape (3, 3) [m^2].
+        """Return the covariance of the point at s relative to the vehicle, from sightings and attitude, shape (3, 3) [m^2].
 
-        The sightings' part has the camera's mount in it, which the fit estimates. The odometry's position is left out: its drift
+        The sightings' part includes the camera's mount, which the fit estimates. The odometry's position is excluded: its drift
         moves vehicle and wires together.
         """
         assert self._body is not None  # it was seen from somewhere
@@ -228,14 +229,14 @@ class LineMapper:
 
 
 def _chord(curve: WireCurve, a: float, b: float, radius: float, offset: np.ndarray) -> Segment:
-    """The straight piece nearest to the wire between a and b: the chord, moved by a third of the sag's two thirds, and by `offset` (3,) [m]."""
+    """Return the segment nearest to the wire between a and b: its chord, moved by two thirds of the sag and `offset` (3,) [m]."""
     lift = -curve.curvature * (b - a) ** 2 / 12.0  # mean of the parabola below its chord
     shift = lift * curve.axes[:, 1] + offset
     return Segment.between(curve.at(a) + shift, curve.at(b) + shift, radius)
 
 
 def _thinned(observations: list[LineObservation]) -> list[LineObservation]:
-    """Without the sighting whose neighbours are nearest to each other: the baseline stays, the crowd goes."""
+    """Return the sightings without the one whose neighbours are nearest to each other, which keeps the baseline."""
     centres = np.array([o.p_WC for o in observations])
     gaps = np.linalg.norm(centres[2:] - centres[:-2], axis=1)
     out = int(np.argmin(gaps)) + 1

@@ -1,4 +1,4 @@
-"""A sighting of a wire, placed in the map by the pose of the camera at the exposure."""
+"""Sighting of a wire, placed in the map by the pose of the camera at the exposure."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ class LineObservation:
 
     @property
     def middle(self) -> np.ndarray:
-        """Ray to the middle of what is seen, shape (3,)."""
+        """Ray to the middle of the visible part, shape (3,)."""
         return self.rays_W[len(self.rays_W) // 2]
 
 
 def place(sighting: LineSighting, body: BodyState, mount: CameraMount) -> LineObservation:
-    """A sighting seen by a camera on the body."""
+    """Place a sighting from a camera on the body in W."""
     p_WC, R_WC = mount.pose(body.p_WB, body.R_WB)
     return LineObservation(body.time, p_WC, sighting.rays_C @ R_WC.T, sighting.ends_C @ R_WC.T, sighting.sigma,
                            sighting.width, R_WC)

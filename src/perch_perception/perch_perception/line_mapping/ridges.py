@@ -1,7 +1,7 @@
 """Ridges in a grey image, brighter or darker than both their sides, at several widths: points, directions, signs.
 
-On a ridge the grey value bends most across it and its slope there is zero, which is what tells a line from an edge (Steger, "An
-unbiased detector of curvilinear structures", 1998): the zero lies within the pixel, and is the line's place to a tenth of one.
+Across a ridge the grey value has its largest curvature and zero slope, which distinguishes a line from an edge (Steger, "An
+unbiased detector of curvilinear structures", 1998). The zero lies within the pixel, and locates the line to a tenth of a pixel.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Ridges:
     Attributes:
         pixels: shape (n, 2) [px].
         tangents: unit vectors along the ridges, shape (n, 2).
-        bend: curvature across them, below 0 where they are brighter than their sides, shape (n,) [grey values / px^2 of the level].
-        step: grey value on the right of the tangent (in the image, y down) less that on the left, shape (n,) [grey values].
+        bend: curvature across them, below 0 where brighter than their sides, shape (n,) [grey values / px^2 of the level].
+        step: grey value on the right of the tangent (in the image, y down) minus that on the left, shape (n,) [grey values].
         height: grey value above (below: negative) the mean of both sides, shape (n,) [grey values].
         level: of the pyramid in which they were found: at 2^-level of the resolution, shape (n,).
     """
@@ -41,7 +41,7 @@ class Ridges:
 
 
 def ridges(grey: np.ndarray) -> Ridges:
-    """Ridge points of an image, uint8 (height, width)."""
+    """Return the ridge points of an image, uint8 (height, width)."""
     found, level_image = [], np.asarray(grey, np.float32)
     for level in range(LEVELS):
         found.append(_of_level(level_image, level))
@@ -54,7 +54,7 @@ def ridges(grey: np.ndarray) -> Ridges:
 
 
 def _of_level(image: np.ndarray, level: int) -> tuple[np.ndarray, ...]:
-    """The columns of `Ridges` from one level of the pyramid, pixels in those of the full image."""
+    """Return the columns of `Ridges` from one level of the pyramid, in pixels of the full image."""
     smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR))
     slope, bend, one = (np.array(kernel, np.float32) for kernel in ([-0.5, 0.0, 0.5], [1.0, -2.0, 1.0], [1.0]))
     xx, yy, xy = (np.asarray(cv2.sepFilter2D(smooth, -1, a, b)) for a, b in ((bend, one), (one, bend), (slope, slope)))

@@ -1,9 +1,9 @@
-"""Wires among ridge points: straight arcs over the whole image, more than chance, with the same behind both sides, often parallel.
+"""Selection of wires among ridge points: long straight arcs, beyond chance, with the same background on both sides.
 
-A straight wire lies on a plane through the optical centre, under any lens: every ridge point votes for the great circles that it may
-lie on. Whether the points on one are more than chance is asked of the image itself: beside the arc, where the wire is not, ridges
-in the same direction say how common they are. Kerbs, roofs and the edges of fields are ridges, too; but they end within the image,
-and most have something else on either side. A wire comes into the image over its border and crosses it, or runs beside one that does.
+A straight wire lies on a plane through the optical centre, under any lens: every ridge point votes for the great circles on which
+it may lie. Whether an arc has more points than chance is estimated from the image itself: ridges of the same direction beside the
+arc show how common they are. Kerbs, roofs and the edges of fields are ridges as well, but they end within the image, and most
+have different backgrounds on their two sides. A wire crosses the image from its border, or is parallel to one that does.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class Arc:
         points: their indices, in order along it, shape (n,).
         scatter: of the points across the arc, 1 sigma [px].
         normal: of the circle's plane in C, shape (3,).
-        bright: brighter than what is on both sides.
-        chance: log10 of how many arcs as good are expected by chance.
-        share: of the part of the circle that the camera sees.
-        short: by what share of that part the arc ends before the border of the image that it comes nearest to.
+        bright: whether it is brighter than both sides.
+        chance: log10 of the number of equally good arcs expected by chance.
+        share: share of the circle's visible part that the arc covers.
+        short: gap between the arc and the nearer border of the image, as a share of the circle's visible part.
         salience: curvature across it times its number of points.
-        level: of the pyramid, mostly.
+        level: median pyramid level of its points.
     """
 
     points: np.ndarray
@@ -63,12 +63,12 @@ class Arc:
 
 
 def wires(found: Ridges, camera: Camera, tolerance: float, least: float) -> list[Arc]:
-    """Arcs that are taken for wires.
+    """Return the arcs that are classified as wires.
 
     Args:
         found: ridge points of an image.
         camera: its lens.
-        tolerance: distance of a point from its arc [px].
+        tolerance: greatest distance of a point from its arc [px].
         least: shorter arcs are left out [px].
     """
     rays = camera.unproject(found.pixels)
@@ -84,7 +84,7 @@ def wires(found: Ridges, camera: Camera, tolerance: float, least: float) -> list
 
 
 def _same_line(one: Arc, other: Arc, rays: np.ndarray, focal: float) -> bool:
-    """Whether an arc is another one again, or a rim of it."""
+    """Whether an arc duplicates another one, or is a rim of it."""
     return bool(np.mean(np.abs(rays[one.points] @ other.normal) * focal < LOBE * 2.0**other.level) > 0.6)
 
 
@@ -94,7 +94,7 @@ def _parallel(one: Arc, other: Arc) -> bool:
 
 
 def _arcs(found: Ridges, rays: np.ndarray, camera: Camera, tolerance: float, least: float) -> list[Arc]:
-    """Arcs of both signs with the same on both sides."""
+    """Return the arcs of both signs with the same background on both sides."""
     ahead = camera.unproject(found.pixels + 2.0 * found.tangents)
     normals = np.cross(rays, ahead)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -120,7 +120,7 @@ def _arcs(found: Ridges, rays: np.ndarray, camera: Camera, tolerance: float, lea
 
 
 class _Votes:
-    """How many points may lie on the plane of each cell: its direction in the image, and its angle from the optical axis."""
+    """Number of points that may lie on the plane of each cell: its direction in the image, its angle from the optical axis."""
 
     def __init__(self, rays: np.ndarray, normals: np.ndarray, focal: float) -> None:
         planes = np.cos(TURNS)[:, None, None] * normals + np.sin(TURNS)[:, None, None] * np.cross(rays, normals)
@@ -134,12 +134,12 @@ class _Votes:
         self.take(np.ones(len(rays), bool), -1.0)
 
     def take(self, points: np.ndarray, count: float = 1.0) -> None:
-        """Take the votes of points (n,) away."""
+        """Remove the votes of points (n,), `count` per vote."""
         cells = self._cells[:, points].ravel()
         self._votes -= count * np.bincount(cells, minlength=self._votes.size).reshape(self._shape).astype(np.float32)
 
     def most(self, least: float) -> np.ndarray | None:
-        """Normal (3,) of the plane with most votes; None where it has fewer than `least` with its neighbours."""
+        """Return the normal (3,) of the plane with most votes; None where it has fewer than `least` with its neighbours."""
         sums = cv2.blur(self._votes, (3, 3), borderType=cv2.BORDER_CONSTANT)
         row, column = np.unravel_index(np.argmax(sums), self._shape)
         if 9.0 * sums[row, column] < least:
@@ -150,7 +150,7 @@ class _Votes:
 
 
 def _along(found, rays, normals, left, normal, camera, tolerance, least) -> tuple[Arc | None, np.ndarray]:
-    """The arc near a plane among the points that are `left`, if there is one, and the points that are used up by it."""
+    """Return the arc near a plane among the points `left`, or None, and the points that are used up by it."""
     focal, used = camera.fx, np.zeros(len(left), bool)
     across, turned = np.arcsin(np.clip(rays @ normal, -1.0, 1.0)) * focal, normals @ normal
     near = np.flatnonzero(left & (np.abs(turned) > ASKEW) & (np.abs(across) < BESIDE[1] + 2.0 * REACH))
@@ -201,7 +201,7 @@ def _along(found, rays, normals, left, normal, camera, tolerance, least) -> tupl
 
 
 def _visible(camera: Camera, forward: np.ndarray, side: np.ndarray, middle: float) -> tuple[float, float]:
-    """Angles along the great circle between which the camera sees it around a place on it [rad]."""
+    """Return the angles along the great circle between which it is visible, around the angle `middle` [rad]."""
     angles = middle + np.linspace(-np.pi, np.pi, 721)
     pixels, valid = camera.project(np.cos(angles)[:, None] * forward + np.sin(angles)[:, None] * side)
     hidden = ~(valid & camera.contains(pixels))
@@ -211,7 +211,7 @@ def _visible(camera: Camera, forward: np.ndarray, side: np.ndarray, middle: floa
 
 
 def _densest(shown: np.ndarray) -> tuple[int, int]:
-    """The stretch of pieces that shows most beyond `SEEN` of it (Kadane)."""
+    """Return the stretch of pieces in which the number of ridges most exceeds the share `SEEN` (Kadane's algorithm)."""
     total = np.concatenate([[0.0], np.cumsum(np.where(shown, 1.0 - SEEN, -SEEN))])
     end = int(np.argmax(total - np.minimum.accumulate(total)))
     return int(np.argmin(total[:end + 1])), end

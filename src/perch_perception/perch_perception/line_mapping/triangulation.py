@@ -1,13 +1,12 @@
-"""A wire in space from its sightings along a path.
+"""Triangulation of a wire from its sightings along a path.
 
 Each sighting gives a plane through the camera's centre that contains the wire: n . d = 0 and n . (p - c) = 0. Their
-intersection is the start; a robust least-squares fit to all rays, with the poses' own errors, refines it and says how
-well it is known. The odometry drifts as it flies: in its frame the wire wanders, and is estimated where it is now. Where
-the camera moved along the wire or towards it, all planes are the same plane, and the depth would be off by metres: such
-baselines are refused.
+intersection is the initial guess; a robust least-squares fit to all rays, with the poses' own errors, refines it and gives its
+covariance. As the odometry drifts, the wire moves in its frame: the wire's place at the last sighting is estimated. Where the
+camera moved along the wire or towards it, all planes coincide, and the depth would be off by metres: such baselines are refused.
 
-A wire has one radius, and looks the wider the nearer it is: sin(width / 2) = radius / distance. From afar triangulation gives the
-distance, and so the radius; near the wire, where the camera flies towards it, the radius gives the distance.
+A wire has one radius, and appears wider the nearer it is: sin(width / 2) = radius / distance. Far from the wire, triangulation
+gives the distance, and so the radius; near it, where the camera flies towards the wire, the radius gives the distance.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ ALL = PARAMETERS + 4   # the wire, the camera's mount, the logarithm of the radi
 
 @dataclass(frozen=True)
 class TriangulationConfig:
-    """What the poses are worth, and what is known of the wires."""
+    """Uncertainty of the poses, and prior knowledge of the wires."""
 
     pose_drift: float = config.quantity(0.01, unit="m/sqrt(s)", low=0.0, high=1.0,
                                         doc="random walk of the odometry; the wire is where the newest sightings see it")
@@ -50,7 +49,7 @@ class TriangulationConfig:
 
 
 class Undetermined(PerchError):
-    """The sightings do not determine a wire, and why."""
+    """Raised when the sightings do not determine a wire; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +60,9 @@ class WireEstimate:
         curve: the wire in W.
         covariance: of its five parameters (see `WireCurve.moved`), shape (5, 5).
         used: sightings that agree with it, shape (n,).
-        mount: error of the camera's attitude on the body that fits them best, in C [rad], shape (3,).
-        radius: of the wire [m]; nan where it is not known and was never wide enough in an image.
-        time: of the last sighting: there the wire is where `curve` has it [s].
+        mount: estimated error of the camera's attitude on the body, in C [rad], shape (3,).
+        radius: of the wire [m]; nan where its width was never measured.
+        time: of the last sighting, for which `curve` is valid [s].
     """
 
     curve: WireCurve
@@ -74,13 +73,13 @@ class WireEstimate:
     time: float = 0.0
 
     def width_from(self, p_WC: np.ndarray) -> float:
-        """How wide it looks from a place (3,) [rad]; nan where its radius is not known."""
+        """Return the wire's angular width from a place (3,) [rad]; nan where its radius is not known."""
         to = self.curve.point - p_WC
         distance = float(np.linalg.norm(to - (to @ self.curve.direction) * self.curve.direction))
         return float(2.0 * np.arcsin(min(self.radius / max(distance, 1e-3), 1.0)))
 
     def point_covariance(self, s: float) -> np.ndarray:
-        """Covariance of the point at s in W [m^2], shape (3, 3); across the wire only."""
+        """Return the covariance of the point at s in W [m^2], shape (3, 3); across the wire only."""
         axes = self.curve.axes
         by_parameters = np.zeros((3, PARAMETERS))
         by_parameters[:, 0:2] = axes[:, :2]
@@ -90,7 +89,7 @@ class WireEstimate:
 
 
 def intersect_planes(observations: Sequence[LineObservation]) -> WireCurve:
-    """The straight line that all planes share.
+    """Return the straight line that all planes share.
 
     Raises:
         Undetermined: fewer than two sightings, or planes that are nearly the same.
@@ -115,15 +114,15 @@ def intersect_planes(observations: Sequence[LineObservation]) -> WireCurve:
 
 def triangulate(observations: Sequence[LineObservation], settings: TriangulationConfig,
                 before: WireEstimate | None = None) -> WireEstimate:
-    """The wire that the sightings share.
+    """Triangulate a wire from its sightings.
 
     Args:
         observations: sightings of one wire.
-        settings: what is known of poses and wires.
+        settings: uncertainty of the poses, and prior knowledge of the wires.
         before: an earlier result; its point keeps the origin of s where it is.
 
     Raises:
-        Undetermined: the camera's motion does not determine the wire, or puts it behind the camera, or the sightings are of several.
+        Undetermined: the motion does not determine the wire, it would be behind the camera, or the sightings are of several.
     """
     line = intersect_planes(observations)
     curve, mount = (line, np.zeros(3)) if before is None else (before.curve, before.mount)
@@ -164,7 +163,7 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
 
 
 def _before(observations: Sequence[LineObservation], before: WireEstimate | None) -> tuple[float, int]:
-    """Variance of an earlier result's place [m^2], and the last of the sightings that it rests on."""
+    """Return the variance of an earlier result's place [m^2], and the index of the last sighting that it includes."""
     if before is None:
         return 0.0, -1
     return (float(np.linalg.eigvalsh(before.covariance[:2, :2])[-1]),
@@ -172,7 +171,7 @@ def _before(observations: Sequence[LineObservation], before: WireEstimate | None
 
 
 def _drifted(observations: Sequence[LineObservation], settings: TriangulationConfig) -> np.ndarray:
-    """Variance that the odometry's random walk adds before each sighting, shape (n,) [m^2]."""
+    """Return the variance that the odometry's random walk adds before each sighting, shape (n,) [m^2]."""
     times, centres = np.array([o.time for o in observations]), np.array([o.p_WC for o in observations])
     waited = np.maximum(np.diff(times, prepend=times[0]), 0.0)
     moved = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
@@ -180,17 +179,17 @@ def _drifted(observations: Sequence[LineObservation], settings: TriangulationCon
 
 
 def _normal_equations(linear: tuple[np.ndarray, np.ndarray], weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """J' w J (n, 9, 9) and J' w r (n, 9) of every sighting, from its residuals r (n, k) and Jacobian J (n, k, 9)."""
+    """Return J' w J (n, 9, 9) and J' w r (n, 9) of every sighting, from its residuals r (n, k) and Jacobian J (n, k, 9)."""
     residual, jacobian = linear
     return np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian), np.einsum("n,nki,nk->ni", weight, jacobian, residual)
 
 
 def _wandering(by_rays, by_widths, walk, settings, curvature, mount):
-    """Information (9, 9) and gradient (9,) of the wire where it is after the last sighting, of the camera's mount and the radius.
+    """Return information (9, 9) and gradient (9,) of the wire after the last sighting, the camera's mount and the radius.
 
-    A filter in information form from the oldest sighting to the newest: before each, the wire's two offsets lose what the
-    odometry's random walk takes, W = walk G G', so that I <- (I^-1 + W)^-1. All sightings from before a drift share it:
-    together they know the wire's place no better than that, however many they are.
+    An information filter runs from the oldest sighting to the newest. Before each, the odometry's random walk W = walk G G'
+    reduces the information on the wire's two offsets: I <- (I^-1 + W)^-1. All sightings before a drift share its error: however
+    many they are, they do not determine the wire's place any better.
     """
     parts, slopes = by_rays[0] + by_widths[0], by_rays[1] + by_widths[1]
     tight = np.concatenate([np.zeros(4), [1.0 / SAG**2], np.full(3, settings.mount_rotation**-2), [1e-6]])  # of the radius nothing is known
@@ -206,7 +205,7 @@ def _wandering(by_rays, by_widths, walk, settings, curvature, mount):
 
 
 def _log_radius(curve, observations):
-    """Logarithm of the radius that the widths say on the whole; nan without any."""
+    """Return the median logarithm of the radius from the measured widths; nan without any."""
     seen = [o for o in observations if o.width > 0.0]
     if not seen:
         return float("nan")
@@ -215,17 +214,17 @@ def _log_radius(curve, observations):
 
 
 def _feet(curve, observations):
-    """From the cameras to the points of the wire that are square to them, shape (n, 3) [m], and the s of these points (n,)."""
+    """Return the perpendicular vectors from the cameras to the wire, shape (n, 3) [m], and the s of their feet (n,)."""
     to = curve.point - np.array([o.p_WC for o in observations])
     s = -to @ curve.direction
     return to + s[:, None] * curve.direction + (0.5 * curve.curvature * s * s)[:, None] * curve.axes[:, 1], s
 
 
 def _widths(curve, size, observations, apart):
-    """Residuals (n, 1) of log sin(width / 2) + log(distance) - log(radius) in sigmas with their Jacobian (n, 1, 9), and which are of one wire.
+    """Return residuals (n, 1) of log sin(width / 2) + log(distance) - log(radius) in sigmas, Jacobian (n, 1, 9), validity.
 
-    A width that says a distance farther off than `apart` (n,) [m^2] allows is that of two wires which meet in the image, or of a part
-    of one: the rays to its middle are not those to a wire's axis, either.
+    A width whose distance differs by more than the variance `apart` (n,) [m^2] allows belongs to two wires that meet in the
+    image, or to a part of one wire: its sighting's rays do not point to a wire's axis either.
     """
     residual, jacobian = np.zeros((len(observations), 1)), np.zeros((len(observations), 1, ALL))
     one_wire = np.ones(len(observations), bool)
@@ -247,7 +246,7 @@ def _widths(curve, size, observations, apart):
 
 
 def _whitened(curve, mount, observations, centres, rays, walk):
-    """Residuals (n, k) in sigmas and their Jacobian (n, k, 9) by wire, mount and radius, decorrelated within each image.
+    """Return residuals (n, k) in sigmas and their Jacobian (n, k, 9) by wire, mount and radius, decorrelated within each image.
 
     All rays of one image share its pose error: n . (dtheta x r) and n . (d x dc) / distance move them together. `walk` (n,)
     is added to the variance of the positions [m^2].

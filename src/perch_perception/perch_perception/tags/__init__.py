@@ -1,4 +1,4 @@
-"""The perching target from camera images: tags found, corners measured, pose of the board solved and fused."""
+"""Localisation of the perching target in camera images: tag detection, corner measurement, board pose and fusion."""
 
 from perch_perception.tags.average import average_board
 from perch_perception.tags.detector import Detection, TagDetector

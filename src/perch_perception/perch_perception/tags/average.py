@@ -1,8 +1,8 @@
-"""The target as the paper takes it: the mean of the four tags' own poses, with their flips resolved. [M:sec. IV-B]
+"""Target pose by the paper's method: the mean of the four tags' own poses, with their flips resolved. [M:sec. IV-B]
 
 "We average the tags' position and quaternions to obtain the target center position and orientation." A plain average is
 12-20 deg off at the 90th percentile at 3 m, since each tag's pose has two branches; the combination of branches that
-agree best is taken first.
+agrees best is therefore chosen first.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from perch_perception.tags.pose import BoardPose, LocalizationRefusal, intrinsic
 
 
 def average_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, ids: tuple[int, ...]) -> BoardPose:
-    """Average of the single-tag poses. [M:sec. IV-B]
+    """Return the average of the single-tag poses. [M:sec. IV-B]
 
     Args:
         camera: the lens, for the residual.
@@ -24,7 +24,7 @@ def average_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, ids
         ids: numbers of the tags, n of them.
 
     Returns:
-        Pose of S. The covariance is the scatter of the tags' poses over n: what the average itself can know.
+        Pose of S. The covariance is the scatter of the tags' poses over n: the only uncertainty that the average provides.
 
     Raises:
         LocalizationRefusal: fewer than two tags, or a tag without any pose.
@@ -57,7 +57,7 @@ def average_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, ids
 
 
 def _agreeing_branches(attitudes: list[list[np.ndarray]]) -> list[int]:
-    """Index of the branch of each tag such that all of them agree best: every branch is tried as the reference."""
+    """Return for each tag the index of its branch such that all branches agree best: every branch is tried as the reference."""
     best, choice = np.inf, [0] * len(attitudes)
     for reference in (R for found in attitudes for R in found):
         angles = [[np.arccos(np.clip(0.5 * (np.trace(R @ reference.T) - 1.0), -1.0, 1.0)) for R in found]

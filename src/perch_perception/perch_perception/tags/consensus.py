@@ -1,7 +1,7 @@
-"""Of several sightings with one number, the one where the board has that tag.
+"""Selection of the sighting that belongs to the board, among several with one tag number.
 
-A tag alone says where the whole board is, roughly; the sightings that agree with the pose that most of them agree with are the
-board's. Two boards alike cannot be told apart by that: the expected one is taken, else that which is seen better.
+Each tag alone gives a rough pose of the whole board. The sightings that are consistent with the pose which most of them support
+are those of the board. This does not distinguish two identical boards: the expected one is chosen, else the one that fits better.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ AGREES = 0.35  # mean distance of a sighting's corners from those expected, as a
 
 def consistent(camera: Camera, corners_S: np.ndarray, numbers: np.ndarray, corners: np.ndarray,
                expected: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
-    """Indices of the sightings that show the board, each tag once.
+    """Return the indices of the sightings that show the board, each tag once.
 
     Args:
         camera: the lens.
         corners_S: corners of the board's n tags in S, shape (n, 4, 3) [m].
-        numbers: which of these tags each of k sightings shows, shape (k,).
+        numbers: index of the tag that each of k sightings shows, shape (k,).
         corners: pixels of their corners, shape (k, 4, 2).
         expected: pose (p_CS, R_CS) at which the board is expected.
 

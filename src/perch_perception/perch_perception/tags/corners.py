@@ -1,15 +1,15 @@
-"""Least squares over the corners of a board, whose lens and print are known but for their sigmas.
+"""Least squares over the corners of a board, with uncertain lens and print.
 
-The lens is known to a few tenths of a per cent, which is more of a pixel than the corners' noise: k = (fx, fy, cx, cy) is
+The lens is known to a few tenths of a per cent, which in pixels is more than the corners' noise: k = (fx, fy, cx, cy) is
 considered. With the corners' derivative G by k, whitened and in k's sigmas, the residuals' covariance is I + G G^T, and
 
     W = (I + G G^T)^-1 = I - G (I + G^T G)^-1 G^T,   A = (J^T W J)^-1 J^T W,   cov = A A^T (noise) + A G G^T A^T (lens).
 
-Tags are printed or glued as a whole, each a little beside its place: their shifts in the board's plane, of one sigma in both directions,
-are columns of G like the lens's, but for by_intrinsics; what they do to the pose is part of its noise.
+Tags are printed or glued as a whole, each slightly displaced. Their shifts in the board's plane, of one sigma in both directions,
+are columns of G like those of the lens, but not part of by_intrinsics; their effect on the pose is part of its noise.
 
-What no pose and no lens explains is noise: prints and paper put corners elsewhere, too, and the corners' sigmas grow by it. Otherwise
-the lens, which has one sigma whatever the number of corners, is bent to fit what is not its own.
+Residuals that neither pose nor lens explains are noise, for example of print and paper, and increase the corners' sigmas.
+Otherwise the lens, whose sigma does not depend on the number of corners, would be adjusted to fit errors that are not its own.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ EXACT_LENS = np.zeros(4)
 
 @lru_cache(maxsize=256)
 def limit(freedom: int) -> float:
-    """chi^2 over its degrees of freedom that `CONSISTENT` of the boards keep."""
+    """Return the limit of chi^2 over its degrees of freedom, which a share `CONSISTENT` of valid boards meets."""
     return float(chi2_quantile(CONSISTENT, freedom)) / freedom
 
 
@@ -40,9 +40,9 @@ class Corners:
         camera: the lens.
         points_S: the corners in S, shape (m, 3).
         noise: 1-sigma of each [px], shape (m,).
-        pixels: where they were measured, shape (m, 2).
+        pixels: the measured pixels, shape (m, 2).
         lens_sigma: 1-sigma of fx, fy (relative), cx, cy [px], shape (4,).
-        print_sigma: 1-sigma of the place of four corners together [m].
+        print_sigma: 1-sigma of a tag's place on the board, in each direction of its plane [m].
     """
 
     def __init__(self, camera: Camera, points_S: np.ndarray, noise: np.ndarray, pixels: np.ndarray, lens_sigma: np.ndarray,
@@ -53,7 +53,7 @@ class Corners:
         self._consider(pixels)
 
     def start(self, p: np.ndarray, R: np.ndarray) -> None:
-        """Take the lens's derivatives at a pose: at the measured pixels their noise would correlate with the residuals', as a longer lens."""
+        """Evaluate the lens's derivatives at a pose; at the measured pixels their noise would correlate with the residuals."""
         pixels, seen = self._camera.project(self._points @ R.T + p)
         self._by_print = self._printed(p, R)
         self._consider(np.where(seen[:, None], pixels, self._pixels))
@@ -67,7 +67,7 @@ class Corners:
         self._back = np.linalg.solve(np.eye(self._G.shape[1]) + self._G.T @ self._G, self._G.T)
 
     def _printed(self, p: np.ndarray, R: np.ndarray) -> np.ndarray:
-        """Derivative of the whitened pixels by the shift of each tag in its plane, in sigmas, shape (2m, m / 2); (2m, 0) where it has none."""
+        """Return the derivative of the whitened pixels by each tag's shift in sigmas, (2m, m / 2); (2m, 0) without shifts."""
         m = len(self._points)
         if self._print_sigma == 0.0:
             return np.zeros((2 * m, 0))
@@ -78,7 +78,7 @@ class Corners:
         return out.reshape(2 * m, m // 2)
 
     def linearise(self, p: np.ndarray, R: np.ndarray) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """chi^2, gradient (6,) and Gauss-Newton matrix (6, 6) of the reprojection residuals; None beyond the lens."""
+        """Return chi^2, gradient (6,) and Gauss-Newton matrix (6, 6) of the reprojection residuals; None beyond the lens."""
         jacobian, projected = self._jacobian(p, R)
         residual = ((projected - self._pixels) / self._noise[:, None]).ravel()
         if not np.all(np.isfinite(residual)):
@@ -87,9 +87,9 @@ class Corners:
         return float(residual @ weighed), jacobian.T @ weighed, jacobian.T @ self._weighed(jacobian)
 
     def errors(self, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """At the minimum: covariance of (dp, dtheta) from noise and print, (6, 6), and their derivative by the true lens, (6, 4).
+        """Return at the minimum the covariance of (dp, dtheta) from noise and print (6, 6), and derivative by the lens (6, 4).
 
-        Pixels that a longer lens makes larger bring the solution nearer than the truth, which is ahead: -A dr/dk.
+        The derivative is -A dr/dk: pixels that are larger because of a longer lens bring the solution nearer than the truth.
         """
         jacobian, projected = self._jacobian(p, R)
         self._by_print = self._printed(p, R)
@@ -100,10 +100,10 @@ class Corners:
         return A @ A.T + by_print @ by_print.T, -A @ self._by_lens
 
     def unexplained(self, p: np.ndarray, R: np.ndarray) -> float:
-        """Mean square of the whitened residuals that no pose and no lens explains, of corners or of whole tags; 1 where it may be chance.
+        """Return the mean square of the whitened residuals of corners or whole tags that neither pose nor lens explains.
 
-        Pose and lens together move a plane's corners as the homographies do, which have eight parameters. Tags are printed or glued as
-        a whole, so what their corners have in common counts as one error.
+        It is 1 where it may be chance. Pose and lens together move a plane's corners like homographies, which have eight
+        parameters. Tags are printed or glued as a whole, so the common residual of a tag's corners counts as one error.
         """
         jacobian, projected = self._jacobian(p, R)
         residual = ((projected - self._pixels) / self._noise[:, None]).ravel()
@@ -118,7 +118,7 @@ class Corners:
         return max((mean for mean, freedom in means if mean > limit(freedom)), default=1.0)
 
     def rms(self, p: np.ndarray, R: np.ndarray) -> float:
-        """Residual per image axis [px]; corners that are known better count more."""
+        """Return the RMS residual per image axis [px], weighted by the corners' sigmas."""
         residual = self._camera.project(self._points @ R.T + p)[0] - self._pixels
         return float(np.sqrt(np.sum((residual / self._noise[:, None]) ** 2) / np.sum(2.0 / self._noise**2)))
 
@@ -127,7 +127,7 @@ class Corners:
         return whitened - self._G @ (self._back @ whitened)
 
     def _jacobian(self, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivative of the whitened pixels by (dp, dtheta), shape (2m, 6), and the pixels (m, 2); NaN beyond the lens."""
+        """Return the derivative of the whitened pixels by (dp, dtheta), (2m, 6), and the pixels (m, 2); NaN beyond the lens."""
         turned = self._points @ R.T
         points_C = turned + p
         by_point = self._camera.project_jacobian(points_C) / self._noise[:, None, None]
@@ -136,7 +136,7 @@ class Corners:
 
 
 def refine(corners: Corners, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Levenberg-Marquardt on SE(3); returns p, R and chi^2, or None where it leaves the lens."""
+    """Run Levenberg-Marquardt on SE(3); return p, R and chi^2, or None where the start is outside of the lens's image."""
     state = corners.linearise(p, R)
     if state is None:
         return None

@@ -1,7 +1,7 @@
-"""Which tags are in an image and roughly where: OpenCV's marker detector on an enlarged frame or a virtual view.
+"""Detection of tags and of their corners to about 1 px: OpenCV's marker detector on an enlarged frame or a virtual view.
 
-OpenCV identifies; it does not measure. Its own sub-pixel refinement leaves 0.6 px and a range bias of 6-30 cm at 3 m
-(0.06-0.2 px with `tags.refinement`), so it is off.
+OpenCV only identifies the tags. Its own sub-pixel refinement leaves 0.6 px and a range bias of 6-30 cm at 3 m
+(0.06-0.2 px with `tags.refinement`), so it is disabled.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class Detection:
     """Tags of the board in one image.
 
     Attributes:
-        ids: numbers of the tags, ascending; one that is seen several times is there several times.
-        corners: pixels of their corners (TL, TR, BR, BL), shape (n, 4, 2), good to about 1 px.
-        rejected: why other sightings were not used, for people.
+        ids: numbers of the tags, ascending; a tag that is seen several times is listed several times.
+        corners: pixels of their corners (TL, TR, BR, BL), shape (n, 4, 2), accurate to about 1 px.
+        rejected: human-readable reasons why other sightings were not used.
     """
 
     ids: tuple[int, ...]
@@ -39,7 +39,7 @@ class Detection:
 
 
 class TagDetector:
-    """Finds the tags of a board. Holds OpenCV's detectors and nothing that changes with the images."""
+    """Finds the tags of a board. Holds OpenCV's detectors and no state that depends on the images."""
 
     def __init__(self, board: TagBoard, camera: Camera) -> None:
         self.board, self.camera = board, camera
@@ -47,12 +47,12 @@ class TagDetector:
         self._view = _detector(board, VIEW_WINDOW, least=VIEW_LEAST)
 
     def search(self, image: np.ndarray, turn: int | None = None) -> Detection:
-        """Look for tags in the whole frame, enlarged twice.
+        """Detect tags in the whole frame, enlarged twice.
 
         Args:
             image: mono8, shape (height, width).
-            turn: number of this search: successive ones begin with different threshold windows, and end with the first that shows
-                a tag of the board. None: all windows are looked through.
+            turn: number of this search: successive searches begin with different threshold windows, and end with the first window
+                that shows a tag of the board. None: all windows are used.
         """
         large, found = cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), []
         for k in range(len(self._search)):
@@ -63,7 +63,7 @@ class TagDetector:
         return self._select([((corners - 0.5) / 2.0, ids) for corners, ids in found])
 
     def look(self, image: np.ndarray, view: VirtualView, origin: tuple[int, int] = (0, 0)) -> Detection:
-        """Look for tags in a virtual view of the image (mono8), or of the part of it that begins at `origin` (column, row).
+        """Detect tags in a virtual view of the image (mono8), or of the part of it that begins at `origin` (column, row).
 
         Corners are returned in pixels of the camera.
         """
@@ -72,7 +72,7 @@ class TagDetector:
         return self._select([(np.where(valid[..., None], pixels, np.nan), ids)])
 
     def _detect(self, detector: cv2.aruco.ArucoDetector, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Corners (n, 4, 2) in pixels of the image and numbers (n,) of what a detector finds."""
+        """Return corners (n, 4, 2) in pixels of the image and numbers (n,) of the markers that a detector finds."""
         if self.board.corner_squares:
             image = cv2.dilate(image, np.ones((2 * CUT - 1,) * 2, np.uint8))
         found, ids, _ = detector.detectMarkers(image)
@@ -83,7 +83,7 @@ class TagDetector:
         return corners, np.zeros(0, int) if ids is None else np.ravel(ids)
 
     def _select(self, found: list[tuple[np.ndarray, np.ndarray]]) -> Detection:
-        """Keep what belongs to the board and is wholly inside the image; what several detectors see counts once."""
+        """Keep markers of the board that lie wholly inside the image; a marker found by several detectors counts once."""
         rejected, kept = list[str](), list[tuple[int, np.ndarray]]()
         for corners, number in ((c, int(n)) for places, ids in found for c, n in zip(places, ids)):
             side = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean()
@@ -98,9 +98,9 @@ class TagDetector:
 
 
 def _detector(board: TagBoard, window: int, darker: float = 7.0, least: float = 0.03) -> cv2.aruco.ArucoDetector:
-    """OpenCV's detector with a single threshold window [px] (three by default, at three times the cost).
+    """Return OpenCV's detector with a single threshold window [px] (three by default, at three times the cost).
 
-    Contours are followed up from a perimeter of `least`, as a share of the image's longer side (OpenCV's own: 0.03).
+    Contours are used from a perimeter of `least` on, as a share of the image's longer side (OpenCV's default: 0.03).
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = least

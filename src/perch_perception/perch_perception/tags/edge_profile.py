@@ -1,8 +1,8 @@
-"""Where a grey-value profile across the edge of a tag steps from the dark border to the light ring, and how blurred it is.
+"""Position and blur of the step from a tag's dark border to its light ring in a grey-value profile across the edge.
 
 A ring and a border of one module are 1.8 px wide at 3 m, about as much as the blur. The far sides of both leak into the
-profile, and the centroid of the gradient is then off by 0.1 px, always inwards. Fitting all three steps removes that, if
-the blur is right: it is that of the lens, the focus, the motion across this edge and the camera's own sharpening.
+profile, and the centroid of the gradient is then off by 0.1 px, always inwards. Fitting all three steps removes this bias, if
+the blur is right: it results from the lens, the focus, the motion across this edge and the camera's own sharpening.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ USUAL_SPREAD = 0.4                     # of an edge's log blur about that of the
 
 def sample_profiles(image: np.ndarray, points: np.ndarray, normals: np.ndarray, s: np.ndarray,
                     origin: tuple[int, int] = (0, 0)) -> np.ndarray:
-    """Grey values across edges, shape (..., S).
+    """Return the grey values across edges, shape (..., S).
 
     Args:
         image: mono8.
-        points: places on the edges [px], shape (..., 2).
+        points: points on the edges [px], shape (..., 2).
         normals: unit normals of the edges there, pointing from dark to light, shape (..., 2).
         s: offsets along the normals, to be broadcast to shape (..., S) [px].
-        origin: pixel (column, row) of the points that is the first of `image`, a part of the camera's.
+        origin: column and row of the first pixel of `image` in the camera's image.
     """
     x, y = ((points[..., None, k] + s * normals[..., None, k]).astype(np.float32) - np.float32(origin[k]) for k in (0, 1))
     shape = x.shape
@@ -35,7 +35,7 @@ def sample_profiles(image: np.ndarray, points: np.ndarray, normals: np.ndarray, 
 
 
 def gradient_centroid(s: np.ndarray, profiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centroid of the squared slope where it rises: robust far from the edge, biased by neighbouring edges.
+    """Locate a step by the centroid of its squared rising slope: robust far from the edge, biased by neighbouring edges.
 
     Args:
         s: offsets, to be broadcast to shape (..., S) [px].
@@ -50,9 +50,9 @@ def gradient_centroid(s: np.ndarray, profiles: np.ndarray) -> tuple[np.ndarray, 
 
 
 def blur_of(s: np.ndarray, profiles: np.ndarray, module: np.ndarray) -> np.ndarray:
-    """Blur of each edge [px], shape (e,): the one with which the three steps leave least of its mean profile.
+    """Return the blur of each edge [px], shape (e,), with which the three steps fit its mean profile best.
 
-    An edge that says little (its module is narrower than the blur) takes that of the image's other edges.
+    An edge with little information (its module is narrower than the blur) takes the blur of the image's other edges.
 
     Args:
         s: offsets, shape (e, S) [px].
@@ -76,10 +76,10 @@ def blur_of(s: np.ndarray, profiles: np.ndarray, module: np.ndarray) -> np.ndarr
 
 def fit_step(s: np.ndarray, profiles: np.ndarray, module: np.ndarray, blur: np.ndarray,
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Least-squares position of the step at s = x between its neighbours at x - module and x + module.
+    """Fit the position of the step at s = x between its neighbours at x - module and x + module.
 
     Model: g(s) = c0 + c1 F(s - x) + c2 F(s - x - m) + c3 F(s - x + m), with F the step blurred by a Gaussian. The
-    heights c are free (inside, a module of the code is dark or light; outside is whatever surrounds the pad). The
+    heights c are free (inside, a module of the code is dark or light; outside, the surroundings are arbitrary). The
     model is linearised at x = 0, so that one small matrix per edge serves all its profiles.
 
     Args:

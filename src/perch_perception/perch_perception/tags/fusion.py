@@ -1,8 +1,8 @@
-"""Recursive fusion of all images into one target pose in the map, with an honest covariance.
+"""Recursive fusion of all images into one target pose in the map, with a consistent covariance.
 
-A Schmidt-Kalman filter: the target's six errors relative to the vehicle are estimated, the shared errors (calibration, time offset)
-are only considered, with their correlation to the estimate. So corner noise averages out, shared errors do not, and near images, which
-they move less, weigh more. Between images the odometry's drift is process noise.
+A Schmidt-Kalman filter: the target's six errors relative to the vehicle are estimated, the shared errors (calibration, time
+offset) are only considered, with their correlation to the estimate. Corner noise therefore averages out, shared errors do not,
+and near images, which they affect less, have more weight. Between images the odometry's drift is process noise.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ RESTART_AFTER = 5  # so many images in a row that contradict the estimate replac
 
 @dataclass(frozen=True)
 class FusedTarget:
-    """The target after some images. `fuse` returns the next one.
+    """Target estimate from all images so far; `fuse` returns the next one.
 
     Attributes:
         p_WS: position [m], shape (3,).
         R_WS: attitude, shape (3, 3).
         joint: covariance of (dp, dtheta, c), shape (17, 17), c being the shared errors of `map_pose`.
         odometry: covariance of the vehicle's pose at the last image, shape (6, 6).
-        frames: images in it.
-        refused: images in a row that contradicted it.
+        frames: number of images used.
+        refused: number of consecutive images that contradicted the estimate.
     """
 
     p_WS: np.ndarray
@@ -41,21 +41,21 @@ class FusedTarget:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of (dp, dtheta) relative to the vehicle at the last image, in the axes of W, shape (6, 6)."""
+        """Covariance of (dp, dtheta) relative to the vehicle at the last image, in the axes of W, shape (6, 6)."""
         return self.joint[:6, :6]
 
 
 def start_fusion(pose: MapPose) -> FusedTarget:
-    """The target after its first image."""
+    """Return the target after its first image."""
     cross = pose.by_shared @ pose.shared
     return FusedTarget(pose.p_WS, pose.R_WS, np.block([[pose.covariance, cross], [cross.T, pose.shared]]), pose.odometry)
 
 
 def fuse(target: FusedTarget, pose: MapPose) -> FusedTarget:
-    """The target with one more image.
+    """Return the target after one more image.
 
-    An image that contradicts the estimate (a flip, a wrong tag) is counted but not used; after five in a row the
-    estimate is taken to be the wrong one (the pad was moved, the odometry jumped) and starts anew.
+    An image that contradicts the estimate (a flip, a wrong tag) is counted but not used. After five in a row the estimate
+    is considered wrong (the pad was moved, the odometry jumped) and is replaced.
     """
     joint = target.joint.copy()
     joint[:6, :6] += drift(pose.odometry, target.odometry, pose.p_BS_W)

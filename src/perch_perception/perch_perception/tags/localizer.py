@@ -1,8 +1,8 @@
-"""From one image after another to poses of the board: search, then track. [M:sec. IV-B]
+"""Board poses from a sequence of images: search, then track. [M:sec. IV-B]
 
-Searching the whole enlarged frame costs 10 ms and is done at 10 Hz. Once the board is known it is looked at in a virtual
-view aimed at where it must be, given the vehicle's motion: 3 ms, and that finds small and slanted tags. Between such
-looks, which read the tags' numbers anew, the expected corners are good enough to measure the edges at once.
+Searching the whole enlarged frame takes 10 ms and is done at 10 Hz. Once the board is known, its tags are detected in a virtual
+view aimed at its predicted place, which takes 3 ms and finds small and slanted tags. Between these detections, which read
+the tags' numbers again, the expected corners are accurate enough to measure the edges directly.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ CLEAR = 50.0          # chi^2 to the second-best pose of a sighting that can be 
 
 @dataclass(frozen=True)
 class Localization:
-    """What one image says.
+    """Result of one image.
 
     Attributes:
         board: joint pose in the camera, or None.
-        average: the paper's averaged pose, where it is asked for and all tags were seen; else None.
+        average: the paper's averaged pose, where it is enabled and all tags were seen; else None.
         complete: all tags of the board were used.
         searched: the whole frame was searched.
-        message: what is missing or was refused, for people; empty when all is well.
+        message: human-readable description of what is missing or was refused; empty otherwise.
     """
 
     board: BoardPose | None
@@ -75,9 +75,9 @@ class BoardLocalizer:
     Args:
         board: geometry of the tags.
         mount: the camera.
-        max_range: a board further away is taken for one of another size [m].
-        averaging: compute the paper's average too.
-        calibration: how well the lens is known.
+        max_range: a board further away than this is refused as one of another size [m].
+        averaging: whether to compute the paper's average as well.
+        calibration: uncertainty of the lens.
     """
 
     def __init__(self, board: TagBoard, mount: CameraMount, max_range: float = 6.0,
@@ -96,16 +96,16 @@ class BoardLocalizer:
         self._followed = 0                        # images since the numbers were read
 
     def process(self, image: np.ndarray | Callable[[Region], np.ndarray], time: float, body: BodyState | None = None) -> Localization:
-        """Look for the board.
+        """Localise the board.
 
         Args:
-            image: mono8, shape (height, width); or what gives the image of which only a region need hold: while a board is
-                tracked its surroundings are all that is looked at, and between searches nothing is.
+            image: mono8, shape (height, width); or a function that returns an image which is valid in a given region: while a
+                board is tracked only its surroundings are read, and between searches nothing is.
             time: middle of the exposure [s]; must grow from image to image.
-            body: state of the vehicle then; only used to predict where to look.
+            body: state of the vehicle at that time; only used to predict the board's pose.
 
         Returns:
-            The sighting; `board` is None where there is none, and `message` says why.
+            The sighting; `board` is None where there is none, and `message` gives the reason.
         """
         last = self._last
         if last is not None and time - self._last_time <= LOST_AFTER:
@@ -137,7 +137,7 @@ class BoardLocalizer:
 
     def _follow(self, part: _Part, time: float, body: BodyState | None, p_CS: np.ndarray,
                 R_CS: np.ndarray) -> Localization | None:
-        """Measure the corners where they are expected; None where that is not safe, or where one is not found."""
+        """Measure the corners where they are expected; None where this is not reliable, or where a corner is not found."""
         if (self._followed >= FOLLOW_IMAGES or body is None or self._last_body is None
                 or time - self._last_time > FOLLOW_GAP):
             return None
@@ -156,7 +156,7 @@ class BoardLocalizer:
         return result
 
     def _search(self, whole: _Part) -> Detection:
-        """Search the frame, then look closer at what was found: the other tags are not far."""
+        """Search the frame, then detect tags again in a virtual view around those found, which may show more."""
         first = self._distinct(self._detector.search(whole.pixels, self._searches))
         self._searches += 1
         if not first.ids:
@@ -174,7 +174,7 @@ class BoardLocalizer:
         return Detection(best.ids, best.corners, rejected)
 
     def _distinct(self, detection: Detection, expected: tuple[np.ndarray, np.ndarray] | None = None) -> Detection:
-        """Each tag once: of several sightings the one that agrees with the others, or with where the board is expected."""
+        """Keep each tag once: of several sightings the one that agrees with the others, or with the board's expected pose."""
         twice = sorted({i for i in detection.ids if detection.ids.count(i) > 1})
         if not twice:
             return detection
@@ -187,13 +187,13 @@ class BoardLocalizer:
         return self._detector.look(part.pixels, view, part.origin)
 
     def _aim(self, p_CS: np.ndarray, radius: float) -> VirtualView:
-        """The view of a place where the board should be, `radius` [m] around p_CS."""
+        """Return the view of the board's expected surroundings, `radius` [m] around p_CS."""
         distance = float(np.linalg.norm(p_CS))
         share = min(VIEW_MARGIN * radius / max(distance, 1e-3), 0.95)
         return VirtualView.aim(p_CS, float(np.arcsin(share)), VIEW_TAG_SIDE * distance / self._tag_size)
 
     def _predict(self, last: BoardPose, body: BodyState | None) -> tuple[np.ndarray, np.ndarray]:
-        """Where the board should be now, p_CS and R_CS: it stays in the map while the vehicle moves."""
+        """Predict the board's pose, p_CS and R_CS: the board is fixed in the map while the vehicle moves."""
         p, R = last.p_CS, last.R_CS
         if body is None or self._last_body is None:
             return p, R

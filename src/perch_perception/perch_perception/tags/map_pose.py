@@ -1,10 +1,11 @@
-"""The board's pose in the map W, and how uncertain it is relative to the vehicle.
+"""Pose of the board in the map W, with its uncertainty relative to the vehicle.
 
-The odometry's own error at the exposure moves vehicle and board alike: a perch depends on T_BS = T_WB^-1 T_WS alone, so that error is not
-counted here, though it grows for as long as VIO flies. What the odometry drifts after the exposure does count: `perch_core.covariance.drift`.
+The odometry's error at the exposure moves vehicle and board alike. A perch depends on T_BS = T_WB^-1 T_WS alone, so this error is
+not included, although it grows during the flight. The odometry's drift after the exposure counts: `perch_core.covariance.drift`.
 
-Two kinds of errors are left: the corners' noise is new in every image; calibration and time offset are the same in all images, and
-averaging does not remove them. They are kept apart: `noise` is a covariance, `by_shared` says how the shared errors c move the result.
+Two kinds of errors remain: the corners' noise is independent in every image; calibration and time offset are common to all
+images, and averaging does not remove them. They are kept apart: `noise` is a covariance, `by_shared` the derivative of the result
+by the shared errors c.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ class MapPose:
     Attributes:
         p_WS: position [m], shape (3,).
         R_WS: attitude, shape (3, 3).
-        noise: covariance of (dp, dtheta), T_BS turned into the axes of W, from this image alone [m, rad], shape (6, 6).
+        noise: covariance of (dp, dtheta) of T_BS, in the axes of W, from this image alone [m, rad], shape (6, 6).
         by_shared: derivative of (dp, dtheta) by the shared errors c, shape (6, 11).
         shared: covariance of c, shape (11, 11).
         p_BS_W: from the vehicle to S, in W [m], shape (3,).
-        odometry: covariance of the vehicle's pose at the exposure, shape (6, 6); with a later one it says how far the odometry has drifted.
+        odometry: covariance of the vehicle's pose at the exposure, shape (6, 6); with that of a later one it gives the drift.
     """
 
     p_WS: np.ndarray
@@ -48,18 +49,18 @@ class MapPose:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Of (dp, dtheta), relative to the vehicle: noise + G cov(c) G^T, shape (6, 6)."""
+        """Covariance of (dp, dtheta), relative to the vehicle: noise + G cov(c) G^T, shape (6, 6)."""
         return self.noise + self.by_shared @ self.shared @ self.by_shared.T
 
 
 def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: CalibrationSigmas) -> MapPose:
-    """T_WS = T_WB T_BC T_CS with the errors of T_BS, to first order.
+    """Return T_WS = T_WB T_BC T_CS with the errors of T_BS, to first order.
 
     Args:
         board: pose in the camera.
         body: state of the body in the middle of the exposure.
-        mount: nominal place of the camera.
-        calibration: how well that is known.
+        mount: the camera as calibrated.
+        calibration: uncertainty of the camera's extrinsics, lens and time offset.
     """
     R_WB = body.R_WB
     R_WC = R_WB @ mount.R_BC

@@ -3,10 +3,10 @@
 A single small square has two nearly equally good poses (the IPPE ambiguity): averages over single-tag poses flip and
 are 12-20 deg off at 3 m. All corners together, over the pad's 0.56 m, have one clear minimum.
 
-What the least squares over the corners know of lens and print: `corners.py`.
+The least squares over the corners, with the errors of lens and print, are in `corners.py`.
 
-Errors of a pose T_AB = (p_AB, R_AB) are (dp, dtheta) in the axes of A: p = p^ + dp, R = exp(dtheta) R^. That is also what
-the covariance of geometry_msgs/PoseWithCovariance means.
+Errors of a pose T_AB = (p_AB, R_AB) are (dp, dtheta) in the axes of A: p = p^ + dp, R = exp(dtheta) R^. This is also the
+convention of geometry_msgs/PoseWithCovariance.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SUSPECTS = 4                       # tags that are tried one by one as the one t
 
 
 class LocalizationRefusal(PerchError):
-    """The corners do not determine the pose of the board; the message says why."""
+    """Raised when the corners do not determine the pose of the board; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,14 @@ class BoardPose:
     Attributes:
         p_CS: position of S [m], shape (3,).
         R_CS: attitude of S, shape (3, 3).
-        covariance: of (dp, dtheta) in the axes of C [m, rad], shape (6, 6), from the corners' noise alone.
+        covariance: of (dp, dtheta) in the axes of C [m, rad], shape (6, 6), from noise and print but not from the lens.
         ids: tags used.
         rms: residual of the corners, per image axis [px].
         misfit: chi^2 over the degrees of freedom, 1 where the corners are off by their sigmas.
-        unexplained: the same of what neither pose nor lens explains, of corners or whole tags, where that is more than chance; else 1.
-        by_intrinsics: derivative of (dp, dtheta) by errors of the lens's fx, fy (relative) and cx, cy [px] that the
-            solution does not know of, shape (6, 4).
-        branch_gap: by how much chi^2 of the second-best pose is worse; inf where there is only one.
+        unexplained: mean square of the residuals that neither pose nor lens explains, where it is more than chance; else 1.
+        by_intrinsics: derivative of (dp, dtheta) by errors of the lens's fx, fy (relative) and cx, cy [px], which the
+            solution does not estimate, shape (6, 4).
+        branch_gap: excess of chi^2 of the second-best pose over that of the best; inf where there is only one.
         dropped: tags left out as they contradict the others.
     """
 
@@ -65,7 +65,7 @@ class BoardPose:
 def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma: np.ndarray, ids: tuple[int, ...],
                 prior_R_CS: np.ndarray | None = None, start: tuple[np.ndarray, np.ndarray] | None = None,
                 lens_sigma: np.ndarray = EXACT_LENS, print_sigma: float = 0.0) -> BoardPose:
-    """Joint pose over all corners; a tag that contradicts the others is left out.
+    """Solve for the joint pose over all corners; a tag that contradicts the others is left out.
 
     Args:
         camera: the lens; residuals are formed in its pixels.
@@ -74,7 +74,7 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         sigma: 1-sigma of the corners [px], shape (n, 4).
         ids: numbers of the tags, n of them.
         prior_R_CS: predicted attitude; only helps to choose between two minima.
-        start: predicted (p_CS, R_CS) of a board whose pose was unique: spares looking for a second minimum.
+        start: predicted (p_CS, R_CS) of a board whose pose was unique: no second minimum is then searched for.
         lens_sigma: 1-sigma of the lens's fx, fy (relative), cx, cy [px], shape (4,).
         print_sigma: 1-sigma of a tag's place on the board, in each direction of its plane [m].
 
@@ -117,7 +117,7 @@ def _freedom(tags: int) -> int:
 
 
 def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior_R_CS, start=None) -> BoardPose:
-    """Best of the two IPPE branches, or of the start alone, after refinement."""
+    """Return the best of the two IPPE branches, or the start alone, after refinement."""
     points, rays = corners_S.reshape(-1, 3), rays_C.reshape(-1, 3)
     pixels, seen = camera.project(rays)
     if not np.all(seen):
@@ -156,11 +156,11 @@ def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior
 
 
 def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The two poses of a planar target that IPPE finds, best first, as (p_CS, R_CS).
+    """Return the two poses of a planar target that IPPE finds, best first, as (p_CS, R_CS).
 
     Args:
         points_S: coplanar points with z_S = 0, shape (k, 3), k >= 4.
-        rays_C: their unit rays, shape (k, 3); taken to a pinhole aimed at their middle, so any lens will do.
+        rays_C: their unit rays, shape (k, 3); they are transformed to a pinhole aimed at their mean, so any lens is supported.
     """
     z = rays_C.mean(axis=0)
     z /= np.linalg.norm(z)

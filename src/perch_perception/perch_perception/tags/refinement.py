@@ -5,8 +5,9 @@ edge is sampled across at many places, the grey-value step is located in each pr
 these points; a corner is the ray n1 x n2 of two neighbouring edges. OpenCV's CORNER_REFINE_SUBPIX, for comparison,
 is off by 0.6-0.76 px and pulls corners inwards, which biases the range by 6-30 cm at 3 m; here it is 0.05 px.
 
-How well an edge is known is measured on it: pieces of it lie off its line by more than noise where the lens is not as
-calibrated, the paper is not flat, or the camera sharpens and compresses. What all edges share is not seen there: `SYSTEMATIC`.
+The uncertainty of an edge is measured on the edge itself: its pieces deviate from its line by more than noise where the lens is
+not as calibrated, the paper is not flat, or the camera sharpens and compresses. Errors common to all edges do not show in these
+deviations: `SYSTEMATIC`.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class RefinedCorners:
     Attributes:
         rays_C: unit rays in C, shape (n, 4, 3).
         sigma: 1-sigma of each corner along each image axis [px], shape (n, 4).
-        measured: corners both of whose edges were measured, shape (n, 4); the others are where the detector saw them.
+        measured: corners both of whose edges were measured, shape (n, 4); the others are those of the detector.
     """
 
     rays_C: np.ndarray
@@ -58,8 +59,8 @@ def refine_corners(image: np.ndarray, camera: Camera, corners: np.ndarray, origi
         modules: width of a tag between the outer edges of its border.
 
     Returns:
-        Rays of the corners. One keeps its place, and is as uncertain as the detector's, where an edge has too little contrast, is
-        too short, or moves further than a first guess may be wrong.
+        Rays of the corners. A corner is left as given, with the detector's uncertainty, where an edge has too little contrast
+        or is too short, or where the corner would move further than the detector's error allows.
     """
     corners = np.asarray(corners, float).reshape(-1, 4, 2)
     if len(corners) == 0:
@@ -84,7 +85,7 @@ _PLACEHOLDER = np.array([[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [
 
 
 def _refine_once(image, origin, camera, rays, modules, coarse):
-    """One round: profiles, steps, planes, corners. Returns rays (n, 4, 3), sigma (n, 4) and which corners are good (n, 4)."""
+    """Run one round: profiles, steps, planes, corners; return rays (n, 4, 3), sigma (n, 4) and which corners are good (n, 4)."""
     n, pixels = len(rays), camera.project(rays)[0]
     points, normals = _edge_points(camera, rays)
     edge = np.roll(pixels, -1, axis=1) - pixels
@@ -117,7 +118,7 @@ def _refine_once(image, origin, camera, rays, modules, coarse):
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of vectors (..., 2) in the image [px^2]."""
+    """Return the cross product of vectors (..., 2) in the image [px^2]."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
@@ -136,8 +137,8 @@ def _edge_points(camera: Camera, rays: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def _fit_planes(rays: np.ndarray, weights: np.ndarray, focal: float, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normals of the planes through the optical centre, (n, 4, 3), and 1-sigma of the lines at their ends [px], (n, 4).
 
-    Weighted total least squares, reweighted once so that a speck or a crossing edge does not pull the line. The end of a line
-    through m independent pieces is known to 2 sigma / sqrt(m); what an edge says of sigma counts beside what its tag says.
+    Weighted total least squares, reweighted once so that a speck or a crossing edge does not pull the line. The 1-sigma of a line
+    through m independent pieces at its end is 2 sigma / sqrt(m); an edge's variance is averaged with its tag's.
     """
     w = weights + 1e-9
     for _ in range(2):

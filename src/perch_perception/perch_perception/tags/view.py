@@ -1,6 +1,6 @@
-"""A virtual pinhole camera aimed at the pad: an upright, enlarged look through the fisheye lens.
+"""Virtual pinhole camera aimed at the pad: an upright, enlarged view through the fisheye lens.
 
-The marker detector wants straight edges and tags of some 60 px; the fisheye delivers tags of 15 px at 3 m. A small
+The marker detector requires straight edges and tags of some 60 px; the fisheye delivers tags of 15 px at 3 m. A small
 image resampled around the pad gives both, at a quarter of the cost of searching the whole enlarged frame.
 """
 
@@ -42,12 +42,12 @@ class VirtualView:
 
     @classmethod
     def aim(cls, direction_C: np.ndarray, half_angle: float, focal: float) -> VirtualView:
-        """The view along a direction that shows everything within an angle of it.
+        """Return the view along a direction that shows everything within an angle of it.
 
         Args:
-            direction_C: what to look at, shape (3,), any length.
-            half_angle: angle that must be visible around it [rad]; cut to 60 deg.
-            focal: wanted focal length [px]; reduced where the image would exceed 640 px.
+            direction_C: viewing direction, shape (3,), any length.
+            half_angle: angle that must be visible around it [rad]; limited to 60 deg.
+            focal: desired focal length [px]; reduced where the image would exceed 640 px.
         """
         z = direction_C / np.linalg.norm(direction_C)
         x = np.cross((0.0, 1.0, 0.0), z)
@@ -66,7 +66,7 @@ class VirtualView:
         return (rays_V / np.linalg.norm(rays_V, axis=-1, keepdims=True)) @ self.R_CV.T
 
     def region(self, camera: Camera, margin: int) -> Region:
-        """The part of a camera's image that the view shows, and `margin` [px] around it; all of it where the lens ends in the view."""
+        """Return the part of a camera's image that the view shows, plus `margin` [px]; all of it where the view exceeds the lens."""
         pixels, valid = camera.project(self.rays(self.centre + 0.5 * self.side * _BORDER))
         if not valid.all():
             return slice(0, camera.height), slice(0, camera.width)
@@ -76,10 +76,10 @@ class VirtualView:
         return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
 
     def resample(self, image: np.ndarray, camera: Camera, origin: tuple[int, int] = (0, 0)) -> np.ndarray:
-        """The view of a camera's image, shape (side, side) uint8; black where the lens sees nothing.
+        """Resample the view from a camera's image, shape (side, side) uint8; black outside of the lens's image.
 
         Args:
-            image: mono8, the camera's or a part of it that holds the view.
+            image: mono8, the camera's or a part of it that contains the view.
             camera: its lens.
             origin: column and row of the part's first pixel.
         """

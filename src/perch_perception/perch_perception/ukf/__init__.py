@@ -1,4 +1,4 @@
-"""The state estimator: an unscented Kalman filter on SO(3) over IMU and delayed VIO poses. Free of ROS."""
+"""State estimator: an unscented Kalman filter on SO(3) that fuses IMU samples and delayed VIO poses. Independent of ROS."""
 
 from perch_core.values import ImuSample
 from perch_perception.ukf.config import ImuNoise, UkfConfig, VioNoise

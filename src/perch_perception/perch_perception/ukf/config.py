@@ -9,15 +9,15 @@ from perch_core.config import derived, part, quantity, text
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """What the filters know of the IMU: the sensor file's word, else that of a MEMS sensor on a vehicle in flight (MPU-9250).
+    """IMU noise and ranges for the filters: from the sensor file, by default those of an MPU-9250 (MEMS) on a vehicle in flight.
 
     Attributes:
         accel_noise_density, gyro_noise_density: vibration included, at any sample rate [m/s^2/sqrt(Hz), rad/s/sqrt(Hz)].
         accel_bias_walk, gyro_bias_walk: [m/s^2/sqrt(s), rad/s/sqrt(s)].
-        accel_bias_init, gyro_bias_init: 1 sigma of the turn-on biases, of data sheets up to 5 deg/s [m/s^2, rad/s].
+        accel_bias_init, gyro_bias_init: 1 sigma of the turn-on biases; data sheets state up to 5 deg/s [m/s^2, rad/s].
         accel_range, gyro_range: saturation of one axis [m/s^2, rad/s].
-        integration: mean: a sample is the mean over the period that ends at its stamp, as IMUs with an averaging filter give it;
-            instant: samples are instantaneous, a step takes the mean of its two ends.
+        integration: `mean`: a sample is the mean over the period that ends at its stamp (IMUs with an averaging filter);
+            `instant`: samples are instantaneous, and a step uses the mean of its two ends.
     """
 
     accel_noise_density: float = 0.015
@@ -33,7 +33,7 @@ class ImuNoise:
 
 @dataclass(frozen=True)
 class VioNoise:
-    """What is added to the covariance that comes with each measurement: some senders leave it at zero."""
+    """Noise added to the pose covariance of each measurement, because some publishers leave the covariance at zero."""
 
     position: float = quantity(0.002, unit="m", above=0.0, doc="1 sigma of each axis")
     attitude: float = quantity(0.002, unit="rad", above=0.0, doc="1 sigma about each axis")
@@ -41,7 +41,7 @@ class VioNoise:
 
 @dataclass(frozen=True)
 class UkfConfig:
-    """The estimator's filter."""
+    """Settings of the estimator's UKF."""
 
     sensors: str = text("", doc="sensor file, config/sensors/<name>.yaml or a path: noise and axes of the IMU; empty: noise of an MPU-9250")
     imu: ImuNoise = derived(ImuNoise())

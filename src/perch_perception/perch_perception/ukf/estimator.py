@@ -1,8 +1,8 @@
-"""The estimator: mean at every IMU step, unscented update at VIO's stamp, replay to now. [M:IV-B]
+"""State estimator: mean at every IMU step, unscented update at the stamp of a VIO pose, replay to the newest sample. [M:IV-B]
 
-Per IMU sample the nominal state moves by one integration step (a few us). A measurement (a pose and, where it is given, a velocity)
-is applied to the belief at its own stamp; the IMU steps since then are replayed through a full unscented transform. VIO's whole state
-takes the belief's place. The equations are in docs/estimation.md.
+Each IMU sample propagates the nominal state by one integration step (a few us). A measurement (a pose and, where given, a
+velocity) is applied to the belief at its own stamp; the later IMU steps are replayed through a full unscented transform. Where
+VIO provides its full state, this replaces the belief. The equations are in docs/estimation.md.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _MOST_WAITING = 20  # poses ahead of the IMU that are kept
 
 
 class Estimator:
-    """Fuses IMU samples and delayed VIO poses; owns its state alone.
+    """Estimator that fuses IMU samples and delayed VIO poses, and owns its state.
 
-    Feed `add_imu` and `add_vio` in order of arrival, read `estimate` and `status`. The same inputs give the same
-    outputs to the last bit.
+    Call `add_imu` and `add_vio` in order of arrival, and read `estimate` and `status`. The same inputs give bit-identical
+    outputs.
     """
 
     def __init__(self, config: UkfConfig = UkfConfig()) -> None:
@@ -59,7 +59,7 @@ class Estimator:
         self._compile()
 
     def add_imu(self, sample: ImuSample) -> ImuOutcome:
-        """Move the estimate to the sample's stamp. Bad samples are bridged or refused; the outcome says which."""
+        """Propagate the estimate to the sample's stamp; bad samples are bridged or refused, see `ImuOutcome`."""
         outcome = self._imu.add(sample)
         if outcome is not ImuOutcome.USED:
             self._message = f"IMU sample at {sample.stamp} ns {outcome.value}"
@@ -77,7 +77,7 @@ class Estimator:
         return outcome
 
     def add_vio(self, pose: VioPose) -> VioOutcome:
-        """Apply a VIO pose at its stamp and replay the IMU; refuse it with a reason where that cannot be done."""
+        """Apply a VIO pose at its stamp and replay the IMU; the outcome states why a pose is refused or has to wait."""
         outcome = pose.problem() or self._timing(pose)
         if outcome is None:
             try:
@@ -96,7 +96,7 @@ class Estimator:
 
     @property
     def estimate(self) -> Estimate | None:
-        """State at the newest IMU stamp; None before VIO's first pose, or its first after a divergence."""
+        """State at the newest IMU stamp; None until a first VIO pose, also after a divergence."""
         if self._live is None:
             return None
         last, x = self._imu.newest, self._x.copy()
@@ -112,7 +112,7 @@ class Estimator:
 
     @property
     def status(self) -> Status:
-        """Health and figures for people and for the mission."""
+        """Health and diagnostics of the estimator."""
         age, position, attitude = math.inf, math.inf, math.inf
         health = Health.DIVERGED if self._broken else Health.INITIALISING
         if self._live is not None:
@@ -125,7 +125,7 @@ class Estimator:
         return Status(health, age, self._accepted, self._rejected, self._breaks, self._nis, position, attitude, self._message)
 
     def _compile(self) -> None:
-        """Run the compiled parts once: on a new machine that takes seconds, which no flight should wait for."""
+        """Run the compiled functions once: their first compilation takes seconds, which must not happen in flight."""
         pose = VioPose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6), np.zeros(3), np.eye(3))
         pose.problem()
         row = np.array([[0.002, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-4, 0.1]])
@@ -135,7 +135,7 @@ class Estimator:
         kernels.advance(belief.x.copy(), 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 0.002)
 
     def _timing(self, pose: VioPose) -> VioOutcome | None:
-        """Why the stamp cannot be applied now, or None."""
+        """Return why a pose cannot be applied now, or None; a pose slightly ahead of the IMU is queued."""
         last = self._imu.last
         if last is None:
             return VioOutcome.NO_IMU
@@ -182,7 +182,7 @@ class Estimator:
         return self._transform.innovate(prior, pose, R)
 
     def _jumped(self, prior: Belief, innovation: Innovation) -> Belief:
-        """Belief that may be off by the whole disagreement: position, attitude, and the velocity that would have built it up."""
+        """Return the prior with a covariance enlarged by the residual: position, attitude, and the velocity that explains it."""
         assert self._base is not None
         elapsed = max((prior.stamp - self._base.stamp) * 1e-9, 0.1)
         p, theta = (innovation.residual[:3] ** 2).sum(), (innovation.residual[3:6] ** 2).sum()
@@ -190,16 +190,16 @@ class Estimator:
         return dataclasses.replace(prior, P=prior.P + np.diag(extra))
 
     def _settle(self, belief: Belief) -> None:
-        """Make a belief the new base, and bring the live state from there up to now."""
+        """Make a belief the new base, and predict the live state from there to the newest IMU stamp."""
         self._base, self._refused_in_row, self._anchors = belief, 0, [belief]
         now = self._imu.newest.stamp
         self._live = self._transform.predict(belief, self._imu.run(belief.stamp, now), now)
         self._x, self._lag = self._live.x.copy(), 0
 
     def _rest(self) -> None:
-        """Without VIO: where the vehicle rests, say so of the middle of the window; a departure may just have begun.
+        """Without VIO poses, apply rest up to the middle of the window where the vehicle rests; a departure may just have begun.
 
-        VIO that speaks knows of the rest itself, or measures the pose in it.
+        Skipped while VIO poses arrive: VIO applies rest itself, or measures the pose at rest.
         """
         now, config = self._imu.newest.stamp, self.config
         if self._base is None or self._live is None or now - max(self._heard, self._base.stamp) < round(1e9 * config.coasting_after):
@@ -221,7 +221,7 @@ class Estimator:
             self._break(str(error))
 
     def _refresh(self) -> None:
-        """Bring the published covariance up to now, and keep a belief from which the kept IMU steps can be replayed."""
+        """Propagate the published covariance to the newest IMU stamp, and keep anchors for a replay of the IMU history."""
         live, now = self._live, self._imu.newest.stamp
         assert live is not None  # there is a base
         try:
@@ -238,7 +238,7 @@ class Estimator:
             self._anchors = [a for a in self._anchors if a.stamp >= now - 2 * half] + [live]
 
     def _break(self, why: str) -> None:
-        """Start again with the next VIO pose."""
+        """Discard the state after a divergence; the next VIO pose restarts the filter."""
         self._base = self._live = None
         self._anchors, self._breaks = [], self._breaks + 1
         self._broken, self._message = True, f"diverged: {why}; waiting for VIO to start again"

@@ -1,4 +1,4 @@
-"""IMU samples kept for replay: checked, turned into integration steps, cut at any stamp."""
+"""IMU history for replay: samples are checked, converted into integration steps and cut at any stamp."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _ABSURD = 1e8  # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
 
 
 def is_sane(sample: ImuSample) -> bool:
-    """Whether a sample is finite and no greater than any sensor's range."""
+    """Whether a sample is finite and within the range of any real IMU."""
     (a, b, c), (x, y, z) = sample.w_B, sample.f_B
     return a * a + b * b + c * c + x * x + y * y + z * z < _ABSURD
 
 
 class ImuOutcome(enum.Enum):
-    """What became of an IMU sample."""
+    """Outcome of adding an IMU sample."""
 
     USED = "used"
     GAP = "used after a gap in the IMU data"
@@ -35,15 +35,15 @@ class ImuOutcome(enum.Enum):
 
     @property
     def used(self) -> bool:
-        """Whether time moved on with this sample."""
+        """Whether the sample became the newest of the buffer."""
         return self not in (ImuOutcome.NOT_NEWER, ImuOutcome.NOT_FINITE)
 
 
 class ImuBuffer:
-    """The steps between IMU samples over the last `history` seconds.
+    """Integration steps between IMU samples over at least the last `history` seconds.
 
     Step k leads from sample k-1 to sample k and is a row (dt, gyro, accel, gyro variance, accel variance). The IMU's period is
-    measured: the median of the last intervals.
+    measured as the median of the last intervals.
     """
 
     def __init__(self, imu: ImuNoise, history: float) -> None:
@@ -58,7 +58,7 @@ class ImuBuffer:
 
     @property
     def newest(self) -> ImuSample:
-        """`last` where there is one."""
+        """The last sample, which must exist."""
         assert self.last is not None
         return self.last
 
@@ -70,7 +70,7 @@ class ImuBuffer:
         return self._ends[0] - round(self._rows[0][0] * 1e9)
 
     def add(self, sample: ImuSample) -> ImuOutcome:
-        """Take a sample; the step that leads to it is then `latest`. A refused one leaves no trace: its stamp may be another writer's."""
+        """Add a sample; `latest` is then the step to it. A refused sample changes nothing: it may be from another publisher."""
         last, imu = self.last, self._imu
         w, f = sample.w_B, sample.f_B
         if not is_sane(sample):
@@ -105,7 +105,7 @@ class ImuBuffer:
         return outcome
 
     def _is_gap(self, interval: int) -> bool:
-        """Whether samples are missing in an interval [ns]; it counts for the period from now on."""
+        """Whether samples are missing in an interval [ns]; the interval is included in the period's median."""
         self._intervals.append(interval)
         period = sorted(self._intervals)[len(self._intervals) // 2]
         return interval > _GAP * period
@@ -121,10 +121,10 @@ class ImuBuffer:
         return float(np.sqrt(self._rows[-1][7])) if self._rows else 0.0
 
     def run(self, start: int, end: int) -> np.ndarray:
-        """The steps from stamp `start` to stamp `end` [ns], the first and last cut to fit, shape (m, 9).
+        """Return the steps from stamp `start` to stamp `end` [ns], the first and last cut to fit, shape (m, 9).
 
-        The error of a sample is one number. What its parts gather in two runs has to make up the variance of the whole step: a
-        part's variance is larger by the ratio of the durations.
+        The variances of a cut step are multiplied by the ratio of the whole duration to the remaining one. The two parts of a
+        step, used in two runs, then add up to the noise of the whole step.
         """
         if end <= start or not self._ends:
             return np.empty((0, 9))

@@ -1,7 +1,7 @@
 """The UKF's inner loops in scalar form: one IMU step of the mean, and sigma points through a run of IMU steps.
 
-Scalar code because numba compiles it to about 0.1 us per IMU step and sigma point, where numpy pays 10 us per
-operation on three numbers. `unscented.py` holds the vectorised second form, used without numba and as a test.
+The code is scalar because numba then needs about 0.1 us per IMU step and sigma point, whereas numpy needs 10 us per
+operation on three numbers. `unscented.py` holds the vectorised form, which is used without numba and in tests.
 Indices follow `layout.py`.
 """
 
@@ -19,7 +19,7 @@ _GRAVITY = 9.81  # numba freezes globals: equal to perch_core.vehicle.GRAVITY, w
 
 @compiled
 def advance(x, w0, w1, w2, a0, a1, a2, dt):
-    """Move one nominal state, in place, by one IMU step: constant rate and specific force over dt.
+    """Propagate a nominal state in place by one IMU step: constant rate and specific force over dt.
 
     p += v dt + (R a + g) dt^2 / 2,  v += (R a + g) dt,  q <- q exp(w dt), with R at the middle of the step
     (second order in the rotation: at 600 deg/s a first-order step would lose 6 mm/s in a 0.3 s flip).
@@ -70,7 +70,7 @@ def advance(x, w0, w1, w2, a0, a1, a2, dt):
 
 @compiled
 def cholesky(P, scale, L):
-    """Lower factor of scale * P into L; False where P is not positive definite."""
+    """Write the lower Cholesky factor of scale * P to L; return False where P is not positive definite."""
     n = P.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -88,7 +88,7 @@ def cholesky(P, scale, L):
 
 @compiled
 def moved(x, sign, e, y):
-    """y (16,) = the nominal state x (16,) moved by the error sign * e (15,)."""
+    """Write the nominal state x (16,), moved by the error sign * e (15,), to y (16,)."""
     for i in range(6):
         y[i] = x[i] + sign * e[i]
         y[10 + i] = x[10 + i] + sign * e[9 + i]
@@ -100,7 +100,7 @@ def moved(x, sign, e, y):
 
 @compiled
 def rotation_vector(q):
-    """Logarithm of a unit quaternion xyzw, of the shorter rotation."""
+    """Return the rotation vector of a unit quaternion xyzw, for the shorter rotation."""
     sign = -1.0 if q[3] < 0.0 else 1.0
     sine = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
     f = sign * (2.0 if sine < 1e-9 else 2.0 * math.atan2(sine, sign * q[3]) / sine)

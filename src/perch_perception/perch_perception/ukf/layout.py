@@ -1,4 +1,4 @@
-"""Where each quantity sits in the UKF's nominal and error vectors, and how an error is put onto a nominal state.
+"""Layout of the UKF's nominal and error vectors; addition of errors to nominal states, and differences of these.
 
 Nominal state (16): p_WB, v_WB, q_WB (xyzw), gyro bias, accelerometer bias.
 Error state (15): p, v, theta, b_g, b_a; the attitude error is a right perturbation, R_WB = R_nominal exp(theta).
@@ -20,7 +20,7 @@ ERROR_SIZE = 15
 
 
 def plus(x: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Nominal state moved by an error.
+    """Return a nominal state moved by an error.
 
     Args:
         x: nominal state, shape (16,).
@@ -40,7 +40,7 @@ def plus(x: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def minus(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The error that takes nominal state x (16,) to y (..., 16), shape (..., 15): `plus(x, minus(y, x)) = y`."""
+    """Return the error that moves nominal state x (16,) to y (..., 16), shape (..., 15): `plus(x, minus(y, x)) = y`."""
     out = np.empty(y.shape[:-1] + (ERROR_SIZE,))
     out[..., D_POSITION] = y[..., POSITION] - x[POSITION]
     out[..., D_VELOCITY] = y[..., VELOCITY] - x[VELOCITY]

@@ -1,4 +1,4 @@
-"""What the estimator takes from VIO, what it gives out, and what became of each input."""
+"""Inputs of the estimator from VIO, outcomes of these inputs, and outputs of the estimator."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perch_core.jit import compiled
 
 
 class VioOutcome(enum.Enum):
-    """What became of a VIO pose."""
+    """Outcome of a VIO pose."""
 
     STARTED = "the filter started with it"
     APPLIED = "applied at its stamp"
@@ -45,7 +45,7 @@ class Health(enum.Enum):
 
 @dataclass(frozen=True)
 class Inertial:
-    """What VIO knows beside its pose and velocity.
+    """VIO's biases and the covariance of its full state.
 
     Attributes:
         gyro_bias, accel_bias: [rad/s], [m/s^2], shape (3,).
@@ -68,7 +68,7 @@ class VioPose:
         covariance: of (position [m], rotation about W's axes [rad]), shape (6, 6).
         v_B: velocity in B [m/s], shape (3,), or None.
         velocity_covariance: of the velocity in B, shape (3, 3), or None.
-        inertial: VIO's biases and the covariance of its whole state, where it gives them; the velocity is given then.
+        inertial: VIO's biases and the covariance of its full state, or None; requires `v_B`.
     """
 
     stamp: int
@@ -80,7 +80,7 @@ class VioPose:
     inertial: Inertial | None = None
 
     def problem(self) -> VioOutcome | None:
-        """Why the pose cannot be used, or None."""
+        """Return why the pose cannot be used, or None."""
         state = (self.inertial.gyro_bias, self.inertial.accel_bias, self.inertial.P) if self.inertial else ()
         numbers = [n for n in (self.p_WB, self.q_WB, self.covariance, self.v_B, self.velocity_covariance, *state) if n is not None]
         if not math.isfinite(sum(n.sum() for n in numbers)) or abs(math.hypot(*self.q_WB) - 1) > 1e-3:
@@ -94,7 +94,7 @@ _LARGEST = 1e8  # a variance beyond that says nothing, and its square would not 
 
 @compiled
 def _is_covariance(C):
-    """Whether a matrix is symmetric and has no negative eigenvalue, up to rounding, and no senseless one."""
+    """Whether a matrix is symmetric and positive semi-definite, up to rounding, and no element exceeds `_LARGEST`."""
     scale = np.abs(C).max()
     if scale > _LARGEST:
         return False
@@ -112,7 +112,7 @@ class Estimate:
         p_WB, v_WB: position and velocity in W [m, m/s], shape (3,).
         q_WB: attitude xyzw, shape (4,).
         w_WB_B: angular velocity in B, bias removed [rad/s], shape (3,).
-        gyro_bias, accel_bias: shape (3,).
+        gyro_bias, accel_bias: [rad/s], [m/s^2], shape (3,).
         P: covariance of (p, v, theta, b_g, b_a), theta a rotation vector in B, shape (15, 15).
     """
 
@@ -128,16 +128,16 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Status:
-    """How the estimator is.
+    """Health and diagnostics of the estimator.
 
     Attributes:
         health: see `Health`.
-        vio_age: time since the stamp of the last applied VIO pose [s]; inf before the first.
-        accepted, rejected: VIO poses applied and gated so far.
-        broken: covariances that lost their positive definiteness, each of which was a start anew.
+        vio_age: time since the stamp of the last applied VIO pose [s]; inf without an estimate.
+        accepted, rejected: numbers of VIO poses applied and gated.
+        broken: number of divergences: covariance not positive definite, or state not finite; each causes a restart.
         nis: normalised innovation squared of the last pose that reached the gate.
-        position_sigma, attitude_sigma: largest 1 sigma [m], [rad]; inf where nothing is known.
-        message: the last event, for people.
+        position_sigma, attitude_sigma: largest 1 sigma [m], [rad]; inf without an estimate.
+        message: human-readable last event.
     """
 
     health: Health

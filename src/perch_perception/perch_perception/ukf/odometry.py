@@ -1,4 +1,4 @@
-"""To and from the axes of nav_msgs/Odometry: a state's covariances, what VIO says."""
+"""Conversion of states to the covariances of nav_msgs/Odometry, and of VIO's messages to `VioPose`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perch_perception.ukf.measurement import Inertial, VioPose
 
 
 def covariances(R_WB: np.ndarray, v_WB: np.ndarray, P: np.ndarray, gyro_noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Pose and twist covariance of an inertial state.
+    """Return pose and twist covariance of an inertial state.
 
     Args:
         R_WB: its attitude, shape (3, 3).
@@ -29,7 +29,7 @@ def covariances(R_WB: np.ndarray, v_WB: np.ndarray, P: np.ndarray, gyro_noise: f
 
 @compiled
 def _covariances(R_WB, hat_v_B, P, gyro_noise):
-    """`covariances` of P (15, 15), with R_WB and [v_B]x (3, 3)."""
+    """Compute `covariances` from R_WB and [v_B]x, both (3, 3), and P (15, 15)."""
     pose_map = np.zeros((6, 15))  # indices: `layout`
     pose_map[:3, 0:3] = np.eye(3)
     pose_map[3:, 6:9] = R_WB
@@ -45,7 +45,7 @@ def _covariances(R_WB, hat_v_B, P, gyro_noise):
 
 
 def vio_state(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, v_WB: np.ndarray, inertial: Inertial) -> VioPose:
-    """VIO's whole state as the estimator takes it.
+    """Return VIO's full state as a `VioPose`.
 
     Args:
         stamp, p_WB, q_WB, inertial: as in `VioPose`.
@@ -57,7 +57,7 @@ def vio_state(stamp: int, p_WB: np.ndarray, q_WB: np.ndarray, v_WB: np.ndarray, 
 
 
 def pose_of(odometry: OdometryState) -> VioPose:
-    """What a value of `vio/odometry` says.
+    """Return the VIO pose in a value of `vio/odometry`.
 
     Raises:
         PerchError: an array is not of the shape that the value names.
@@ -71,7 +71,7 @@ def pose_of(odometry: OdometryState) -> VioPose:
 
 
 def state_of(state: InertialState) -> VioPose:
-    """What a value of `vio/state` says.
+    """Return the VIO pose in a value of `vio/state`.
 
     Raises:
         PerchError: an array is not of the shape that the value names.

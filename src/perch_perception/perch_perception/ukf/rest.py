@@ -1,10 +1,10 @@
-"""The UKF at rest: pose constant, velocity zero, biases seen directly.
+"""Updates of the UKF at rest: constant pose, zero velocity, observed biases.
 
-While the vehicle rests, the IMU is no input of the motion model but a measurement: the pose does not move, the biases walk, and
+While the vehicle rests, the IMU is not an input of the motion model but a measurement: the pose is constant, the biases walk, and
 
     0 = v + n_v,    w_mean = b_g + n_w,    f_mean = b_a + R^T g + n_f.
 
-So position and heading are as certain after an hour as they were when the rest began, and no surer. [OpenVINS: zero-velocity update]
+Position and heading therefore stay as certain as they were when the rest began. [OpenVINS: zero-velocity update]
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from perch_perception.ukf.unscented import ACCEL, DT, GATES, GYRO, Belief, Innov
 
 
 def stopped(belief: Belief) -> Belief | None:
-    """The belief of a vehicle that has come to rest; None: it knows that the vehicle moves, steadily."""
+    """Return the belief after a first zero-velocity update; None where its velocity is not consistent with zero."""
     H = np.zeros((3, at.ERROR_SIZE))
     H[:, at.D_VELOCITY] = np.eye(3)
     innovation = _innovation(belief, H, -belief.x[at.VELOCITY], np.full(3, REST_VELOCITY**2))
@@ -28,7 +28,7 @@ def stopped(belief: Belief) -> Belief | None:
 
 
 def rested(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> Belief:
-    """The belief of a vehicle at rest over IMU steps (m, 9), m > 0, at their end `stamp` [ns]."""
+    """Return the belief of a vehicle at rest over IMU steps (m, 9), m > 0, at their end `stamp` [ns]."""
     imu, x, P = config.imu, belief.x.copy(), belief.P.copy()
     T, d = float(steps[:, DT].sum()), np.arange(3)
     x[at.VELOCITY] = 0.0

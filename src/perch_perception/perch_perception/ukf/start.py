@@ -1,4 +1,4 @@
-"""The filter's first belief: VIO's first pose, or its whole state."""
+"""Initial belief of the filter, from VIO's first pose or its full state."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _STANDS = 0.02  # speed that may be rest [m/s]
 
 
 def white(noise: VioNoise) -> np.ndarray:
-    """What is added to the covariance of a pose, shape (6, 6)."""
+    """Return the noise that is added to the covariance of a pose, shape (6, 6)."""
     return np.diag(np.repeat([noise.position**2, noise.attitude**2], 3))
 
 
 def from_state(pose: VioPose, known: Inertial) -> Belief:
-    """VIO's whole state in the place of this filter's belief.
+    """Return VIO's full state as a belief, which replaces that of this filter.
 
-    VIO integrates the very IMU samples that this filter integrates, and sees images besides: its state at an exposure is this filter's
-    belief after a measurement more, and nothing that is made of both can be better. x := x_VIO, P := P_VIO.
+    VIO integrates the same IMU samples as this filter, and uses images in addition. Its state at an exposure is therefore this
+    filter's belief after one more measurement, and a fusion of both cannot be better. x := x_VIO, P := P_VIO + `_REGULAR` I.
     """
     x = np.zeros(at.NOMINAL_SIZE)
     x[at.POSITION], x[at.QUATERNION] = pose.p_WB, pose.q_WB
@@ -36,13 +36,13 @@ def from_state(pose: VioPose, known: Inertial) -> Belief:
 
 
 def from_pose(config: UkfConfig, pose: VioPose, steps: np.ndarray) -> Belief:
-    """Belief at a first pose.
+    """Return the belief at a first pose.
 
-    At rest the gyro's mean is its bias, and the accelerometer's is what gravity leaves.
+    At rest, the mean gyro reading gives the gyro's bias, and the mean specific force less gravity the accelerometer's.
 
     Args:
         config: the filter's settings.
-        pose: VIO's pose; its velocity is taken where it has one.
+        pose: VIO's pose; its velocity is used where given.
         steps: IMU steps before the pose, shape (m, 9).
     """
     at_rest = still(steps) and (pose.v_B is None or np.linalg.norm(pose.v_B) < _STANDS)

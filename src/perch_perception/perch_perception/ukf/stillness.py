@@ -1,16 +1,16 @@
-"""Rest, told from the IMU alone: the stance hypothesis of Skog et al. (Zero-velocity detection - an algorithm evaluation, 2010).
+"""Detection of rest from the IMU: the stance hypothesis of Skog et al. (Zero-velocity detection - an algorithm evaluation, 2010).
 
-Rotors that carry a vehicle shake it, and its controller never stops correcting; what rests is as quiet as the sensor. Under the
+In flight, rotors and control corrections shake a vehicle; at rest, its IMU is as quiet as the sensor's noise. Under the
 hypothesis that the vehicle rests, gyro and accelerometer read constants with the noise of the sensor,
 
     T = 1/(N - 1) sum ( |f_k - f_mean|^2 / sigma_a^2 + |w_k - w_mean|^2 / sigma_w^2 ),    E[T] = 6,
 
-and these constants are the gyro's bias and, with the accelerometer's bias, g in any direction. What the means may differ by from that
-follows from how well the biases are known and from how much the readings vary; before a filter knows the biases it is what the largest
-turn-on biases make of it.
+and these constants are the gyro's bias and, with the accelerometer's bias, g in any direction. The tolerance of the means follows
+from the uncertainty of the biases and from the scatter of the readings. Where no filter has estimated the biases, the largest
+turn-on biases are assumed.
 
-It holds in any attitude, and needs neither an image nor word from the controller. Constant motion it cannot tell from rest: whoever
-says "zero velocity" on it asks first whether that can be (`ukf.rest`, `vio.rest`).
+The test works in any attitude and requires neither images nor the controller's state. It cannot distinguish constant motion from
+rest: before a zero-velocity update, the caller checks that the estimated velocity allows it (`ukf.rest`, `vio.rest`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _CERTAIN = 6.0  # sigma of a mean that still is taken for zero
 
 
 def energy(steps: np.ndarray) -> float:
-    """T / 6 of IMU steps (m, 9), m > 1: how much they vary, in what the noise of the sensor does."""
+    """Return T / 6 of IMU steps (m, 9), m > 1: the ratio of their scatter to that of the sensor's noise."""
     f, w = steps[:, ACCEL], steps[:, GYRO]
     T = (((f - f.mean(axis=0)) ** 2).sum(axis=1) / steps[:, ACCEL_VARIANCE]).sum()
     T += (((w - w.mean(axis=0)) ** 2).sum(axis=1) / steps[:, GYRO_VARIANCE]).sum()
@@ -45,9 +45,9 @@ def still(steps: np.ndarray, biases: np.ndarray | None = None, variance: np.ndar
 
     Args:
         steps: as from `ImuBuffer.run`, shape (m, 9).
-        biases: of gyro and accelerometer [rad/s, m/s^2], shape (6,); None: not known.
-        variance: of the biases, shape (6,).
-        seen: a camera sees that nothing moves: what shakes the vehicle then, be it its own rotors, does not move it.
+        biases: of gyro and accelerometer [rad/s, m/s^2], shape (6,); None: unknown.
+        variance: of the biases, shape (6,); None: the largest turn-on biases are assumed.
+        seen: the camera images show no motion: vibration, e.g. of the rotors, then does not exclude rest.
     """
     if len(steps) < _LEAST or steps[:, DT].sum() < _ENTIRE * WINDOW:
         return False
@@ -64,11 +64,11 @@ def still(steps: np.ndarray, biases: np.ndarray | None = None, variance: np.ndar
 
 
 def _beyond(steps: np.ndarray, biases: np.ndarray | None, known: np.ndarray) -> np.ndarray:
-    """How far the means of gyro and accelerometer are from rest, beyond what is `known` of their biases, each (2,)."""
+    """Return by how much the mean gyro and accelerometer readings deviate from rest beyond the bias bounds `known`, each (2,)."""
     mean = steps[:, 1:7].mean(axis=0) - (0.0 if biases is None else biases)
     return np.maximum(np.abs([np.linalg.norm(mean[:3]), np.linalg.norm(mean[3:]) - GRAVITY]) - known, 0.0)
 
 
 def window(imu: ImuBuffer, end: int) -> np.ndarray:
-    """The steps over which rest at a stamp `end` [ns] is judged, shape (m, 9)."""
+    """Return the steps over which rest at a stamp `end` [ns] is tested, shape (m, 9)."""
     return imu.run(max(imu.oldest, end - round(WINDOW * 1e9)), end)

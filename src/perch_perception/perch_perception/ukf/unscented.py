@@ -1,8 +1,8 @@
 """The unscented transforms of the UKF: prediction through IMU steps and the update with a pose.
 
-Sigma points and weights are the scaled ones of van der Merwe on the error vector; the points live on the manifold
-through `layout.plus`/`minus`. Prediction runs in `kernels.unscented_run`; without numba, in the vectorised
-form here. The update is in `update_kernels`. The equations are in docs/estimation.md, section UKF.
+Sigma points and weights are the scaled ones of van der Merwe on the error vector; `layout.plus`/`minus` map the points to
+the manifold and back. The prediction uses `kernels.unscented_run` or, without numba, the vectorised form here. The update is
+in `update_kernels`. The equations are in docs/estimation.md, section UKF.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DT, GYRO, ACCEL, GYRO_VARIANCE, ACCEL_VARIANCE = 0, slice(1, 4), slice(4, 7), 7,
 
 
 class CovarianceError(PerchError):
-    """A covariance lost its positive definiteness: the filter has to be started again."""
+    """Raised when a covariance is not positive definite: the filter must restart."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Belief:
 
 @dataclass(frozen=True)
 class Innovation:
-    """What a measurement said against the prediction.
+    """Innovation of a measurement: residual, covariance and gain.
 
     Attributes:
         residual: measured minus predicted, shape (m,).
@@ -80,7 +80,7 @@ class UnscentedTransform:
         self.scale = 0.5 / self.Wm[1]
 
     def predict(self, belief: Belief, run: np.ndarray, stamp: int) -> Belief:
-        """Belief after a run of IMU steps that ends at `stamp`.
+        """Return the belief after a run of IMU steps that ends at `stamp`.
 
         Args:
             belief: at the start of the run.
@@ -104,7 +104,7 @@ class UnscentedTransform:
         return Belief(stamp, x, P)
 
     def predict_vectorised(self, x: np.ndarray, P: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same transform in numpy, all sigma points at once: the form without numba, and the kernel's check."""
+        """Compute the same transform in numpy for all sigma points at once: used without numba and to test the kernel."""
         points = at.plus(x, self._sigma_points(P))
         gravity = np.array([0.0, 0.0, GRAVITY])
         p, v, q = points[:, at.POSITION], points[:, at.VELOCITY], points[:, at.QUATERNION]
@@ -123,14 +123,14 @@ class UnscentedTransform:
         return at.plus(points[0], mean), (centred * self.Wc[:, None]).T @ centred
 
     def innovate(self, belief: Belief, pose: VioPose, R: np.ndarray) -> Innovation:
-        """Innovation and gain for a pose, and with it a velocity, at the belief's time.
+        """Return innovation and gain for a pose and, where measured, a velocity at the belief's time.
 
-        The prediction of a sigma point is p_WB, R_WB and, where the velocity is measured, R_WB^T v_WB. Attitude residuals are rotation
-        vectors in W about the attitude of the centre.
+        The prediction of a sigma point is p_WB, R_WB and, where the velocity is measured, R_WB^T v_WB. Attitude residuals are
+        rotation vectors in W about the attitude of the centre.
 
         Args:
             belief: predicted to the pose's stamp.
-            pose: what is measured.
+            pose: the measurement.
             R: noise of (position, rotation about W's axes), shape (6, 6), or of these and the velocity in B, shape (9, 9).
 
         Raises:
@@ -147,10 +147,10 @@ class UnscentedTransform:
 
     @staticmethod
     def correct(belief: Belief, innovation: Innovation) -> Belief:
-        """Belief after a measurement.
+        """Return the belief after a measurement.
 
-        After the injection the attitude error is counted from the new nominal attitude: its covariance turns by
-        the right Jacobian of the correction.
+        After the injection, the attitude error refers to the new nominal attitude: its covariance is transformed by the right
+        Jacobian of the correction.
         """
         x, P = np.empty(at.NOMINAL_SIZE), np.empty((at.ERROR_SIZE, at.ERROR_SIZE))
         update_kernels.correct(belief.x, belief.P, innovation.gain, innovation.S, innovation.residual, x, P)

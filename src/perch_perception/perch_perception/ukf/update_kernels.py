@@ -1,4 +1,4 @@
-"""The UKF's update with a measurement, compiled: in numpy the calls cost a control period.
+"""Compiled update of the UKF with a measurement: in numpy, its calls would take a whole control period.
 
 `kernels.py` holds the prediction, `unscented.py` the equations. Indices follow `layout.py`.
 """
@@ -16,7 +16,7 @@ from perch_perception.ukf.kernels import cholesky, moved, rotation_vector
 
 @compiled
 def _seen(x, back, z):
-    """What a measurement of the nominal state x (16,) would be, z (6,) or (9,), with the attitude about the inverse of `back`."""
+    """Write the predicted measurement of state x (16,) to z, (6,) or (9,), its attitude relative to the inverse of `back`."""
     q = (x[6], x[7], x[8], x[9])
     turn = rotation_vector(quaternion_product(q, back))
     for i in range(3):
@@ -30,7 +30,7 @@ def _seen(x, back, z):
 
 @compiled
 def _rotated_back(q, v):
-    """R^T v for a unit quaternion xyzw."""
+    """Return R^T v for a unit quaternion xyzw."""
     u = (-q[0], -q[1], -q[2])
     t = cross(u, v)
     t = (2.0 * t[0], 2.0 * t[1], 2.0 * t[2])
@@ -39,17 +39,17 @@ def _rotated_back(q, v):
 
 @compiled
 def innovate(x, P, measured, R, scale, wm0, wc0, wi, residual, S, gain):
-    """`UnscentedTransform.innovate`.
+    """Compute `UnscentedTransform.innovate`.
 
     Args:
         x, P: nominal state (16,) and covariance (15, 15).
-        measured: position and attitude xyzw, (7,), and where R has nine rows the velocity in B, (10,).
+        measured: position and attitude xyzw, (7,); where R has nine rows, also the velocity in B, (10,).
         R: measurement noise, (m, m).
         scale: n + lambda; wm0, wc0: centre weights for mean and covariance; wi: weight of every other point.
         residual, S, gain: results (m,), (m, m), (15, m), overwritten.
 
     Returns:
-        Normalised innovation squared; -1 where P is not positive definite (the results are then undefined).
+        Normalised innovation squared; -1 where P or S is not positive definite (the results are then undefined).
     """
     n, m = 15, len(R)
     L = np.zeros((n, n))
@@ -94,7 +94,7 @@ def innovate(x, P, measured, R, scale, wm0, wc0, wi, residual, S, gain):
 
 @compiled
 def correct(x, P, gain, S, residual, x_out, P_out):
-    """`UnscentedTransform.correct`: the state (16,) and covariance (15, 15) after a measurement, into x_out and P_out."""
+    """Compute `UnscentedTransform.correct`: state (16,) and covariance (15, 15) after a measurement, into x_out and P_out."""
     n, m = 15, len(residual)
     step, spread = np.zeros(n), np.zeros((n, m))
     for i in range(n):
@@ -122,7 +122,7 @@ def correct(x, P, gain, S, residual, x_out, P_out):
 
 @compiled
 def _right_jacobian(phi, v):
-    """J v with J = I - (1 - cos a) / a^2 [phi]x + (a - sin a) / a^3 [phi]x^2, a = |phi|."""
+    """Return J v with J = I - (1 - cos a) / a^2 [phi]x + (a - sin a) / a^3 [phi]x^2, a = |phi|."""
     a = norm(phi)
     f = 0.5 - a * a / 24.0 if a < 1e-4 else (1.0 - math.cos(a)) / (a * a)
     g = 1.0 / 6.0 - a * a / 120.0 if a < 1e-4 else (a - math.sin(a)) / (a * a * a)
@@ -146,10 +146,10 @@ def _solve(L, y):
 
 @compiled
 def add_process_noise(run, gyro_walk2, accel_walk2, P):
-    """Add to P (15, 15) what the noise and the bias walks of a run of IMU steps (m, 9) do.
+    """Add the noise and the bias walks of a run of IMU steps (m, 9) to P (15, 15).
 
-    White noise of each sample: attitude sum(s_g^2 dt^2), velocity sum(s_a^2 dt^2) =: q, which the double integral carries into the
-    position as q T^2/3 and q T/2. Couplings of higher order in T (40 ms) are left out.
+    The white noise adds sum(s_g^2 dt^2) to the attitude, q = sum(s_a^2 dt^2) to the velocity and, by integration, q T^2/3 to the
+    position and q T/2 to its covariance with the velocity. Couplings of higher order in T (40 ms) are neglected.
     """
     T, q, turn = 0.0, 0.0, 0.0
     for k in range(run.shape[0]):

@@ -1,4 +1,4 @@
-"""Visual-inertial odometry: KLT tracks and an MSCKF with landmarks in the state. Free of ROS."""
+"""Visual-inertial odometry: KLT tracks and an MSCKF with landmarks in the state. Independent of ROS."""
 
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.odometry import VisualInertialOdometry

@@ -1,6 +1,6 @@
-"""What a camera says about a point: a unit bearing, its residual against a prediction, and all derivatives.
+"""Camera measurement of a point: a unit bearing, its residual against a prediction, and all derivatives.
 
-Bearings, not pixels: on a fisheye a pixel's error is nearly the same angle everywhere, and nothing is singular at
+Bearings are used instead of pixels: on a fisheye a pixel's error is nearly the same angle everywhere, and nothing is singular at
 90 deg from the axis. A residual is a pair of tangent coordinates at the measured bearing, [rad].
 """
 
@@ -22,8 +22,8 @@ class Bearings:
 
     Attributes:
         b_C: unit vectors in C, shape (n, 3).
-        shape: of the lens there, d theta / d r and r / theta, with r the radius in the normalised image at the angle theta, shape (n, 2).
-        noise: 1 sigma of each over the declared `pixel_noise`, shape (n,); None: 1.
+        shape: local lens model, d theta / d r and r / theta; r: radius in the normalised image at the angle theta, shape (n, 2).
+        noise: ratio of each bearing's 1 sigma to the configured `pixel_noise`, shape (n,); None: 1.
     """
 
     b_C: np.ndarray
@@ -31,7 +31,7 @@ class Bearings:
     noise: np.ndarray | None = None
 
     def chosen(self, rows: np.ndarray) -> Bearings:
-        """Some of them, by index or mask."""
+        """Return a selection of the bearings, by index or mask."""
         return Bearings(self.b_C[rows], self.shape[rows], None if self.noise is None else self.noise[rows])
 
 
@@ -46,9 +46,9 @@ class Residuals:
 
     Attributes:
         r: measured minus predicted, shape (n, 2).
-        J: derivatives by the errors of camera rotation (3) and position (3), time offset, lens (log fx, log fy, cx / fx, cy / fy),
-            the body's theta (3) and position (3), and by the point's position in W (3), shape (n, 2, 20). The time offset's are
-            zero: it acts through the poses (`State.add_clone`).
+        J: derivatives with respect to the errors of camera rotation (3) and position (3), time offset, lens (log fx, log fy,
+            cx / fx, cy / fy), the body's theta (3) and position (3), and the point's position in W (3), shape (n, 2, 20). The
+            column of the time offset is zero: the offset acts through the poses (`State.add_clone`).
         cosine: between measured and predicted bearing, shape (n,).
         distance: from the camera to the point [m], shape (n,).
     """
@@ -60,7 +60,7 @@ class Residuals:
 
 
 def observe(camera: Camera, pixels: np.ndarray) -> Bearings:
-    """Bearings of pixels, shape (n, 2)."""
+    """Return the bearings of pixels, shape (n, 2)."""
     if isinstance(camera, EquidistantCamera):
         return Bearings(*lens.observe(camera, pixels))
     b = camera.unproject(pixels)
@@ -69,7 +69,7 @@ def observe(camera: Camera, pixels: np.ndarray) -> Bearings:
 
 @compiled
 def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, shape, r, J, cosine, distance):
-    """Fill r, J, cosine, distance of `Residuals`; loops because numpy's calls cost more than the numbers."""
+    """Fill r, J, cosine, distance of `Residuals`; loops because the overhead of numpy calls exceeds the arithmetic."""
     X_B, X_C, u, b, e = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     by_C, by_B = np.zeros(3), np.zeros(3)
     for n in range(X_W.shape[0]):
@@ -130,7 +130,7 @@ def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, shape, r, J, cosine, distance):
 
 def residuals(R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, R_BC: np.ndarray, p_BC: np.ndarray,
               measured: Bearings) -> Residuals:
-    """Residuals of points seen from body poses.
+    """Return the residuals of points seen from body poses.
 
     u = unit(R_BC^T (R_WB^T (X - p_WB) - p_BC)), r = B (b - u) with B the tangent basis at the measured b.
 

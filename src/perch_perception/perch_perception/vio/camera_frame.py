@@ -1,8 +1,8 @@
-"""Points as a camera sees them: direction and log distance, whose errors stay in place when the state moves.
+"""Landmark errors in the camera frame: direction and log distance, which stay constant when an update moves the state.
 
-Robocentric landmarks (Bloesch et al. 2017), for points that are kept in W. An observation is linear in the direction, and what it tells
-of the camera's rotation on the body does not depend on the distance. In W both would be products of estimates, and each step of these
-would make up a rotation, or a distance, that no image has shown.
+This applies robocentric landmarks (Bloesch et al. 2017) to points that are kept in W. An observation is linear in the direction,
+and its information on the camera's rotation relative to the body does not depend on the distance. With errors in W both would be
+products of estimates, and each update would add information on a rotation or a distance that no image contains.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ class Seen:
 
     Attributes:
         X_C: shape (m, 3).
-        by_camera: derivative of X_C by theta, p, and the camera's rotation and position on the body, shape (m, 3, 12).
-        R_CW: derivative by the point in W, shape (3, 3).
+        by_camera: derivative of X_C with respect to theta, p, camera rotation and camera position, shape (m, 3, 12).
+        R_CW: derivative with respect to the point in W, shape (3, 3).
     """
 
     X_C: np.ndarray
@@ -31,7 +31,7 @@ class Seen:
 
 
 def see(R_WB: np.ndarray, p_WB: np.ndarray, R_BC: np.ndarray, p_BC: np.ndarray, X_W: np.ndarray) -> Seen:
-    """Points in W, shape (m, 3), from a pose of the body by a camera on it."""
+    """Transform points in W, shape (m, 3), into C, with derivatives, given the poses of the body and of the camera on it."""
     X_B = (X_W - p_WB) @ R_WB
     X_C = (X_B - p_BC) @ R_BC
     by_camera = np.empty((len(X_W), 3, 12))
@@ -41,13 +41,13 @@ def see(R_WB: np.ndarray, p_WB: np.ndarray, R_BC: np.ndarray, p_BC: np.ndarray, 
 
 
 def moved(X_C: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points moved by a small step dX_C: direction and log distance by what it says of them.
+    """Move points by a small step dX_C, applied in direction and log distance.
 
     Args:
         X_C, step: shape (m, 3).
 
     Returns:
-        X_C', shape (m, 3), and the turn and stretch S of an error that stays the same in direction and log distance,
+        X_C', shape (m, 3), and the rotation and scaling S of an error that is constant in direction and log distance,
         dX_C' = S dX_C, shape (m, 3, 3).
     """
     d2 = (X_C**2).sum(axis=1, keepdims=True)
@@ -57,11 +57,11 @@ def moved(X_C: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def carried(before: Seen, after: Seen, S: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What keeps the errors of m points in C in place, but for S, when camera and points have moved.
+    """Return the transform of errors in W that keeps those of m points in C constant, except for S, when camera and points move.
 
         dX_W' = by_camera dc - by_moved dc' + by_point dX_W,
 
-    with dc, dc' the camera's errors before and after.
+    where dc, dc' are the camera's errors before and after.
 
     Returns:
         by_camera and by_moved, shape (3m, 12), by_point, shape (m, 3, 3).

@@ -12,14 +12,14 @@ from perch_perception.ukf.config import ImuNoise
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """KLT tracks."""
+    """Settings of the KLT tracker."""
 
     features: int = quantity(100, low=10, high=400, doc="tracks to keep up")
 
 
 @dataclass(frozen=True)
 class FilterConfig:
-    """The MSCKF."""
+    """Settings of the MSCKF."""
 
     clones: int = quantity(11, low=4, high=30, doc="poses in the sliding window")
     landmarks: int = quantity(25, low=0, high=100, doc="points kept in the state")
@@ -30,7 +30,7 @@ class FilterConfig:
 
 @dataclass(frozen=True)
 class VioConfig:
-    """Visual-inertial odometry."""
+    """Settings of visual-inertial odometry."""
 
     imu: ImuNoise = derived(ImuNoise())
     calibration: CalibrationSigmas = derived(CalibrationSigmas())

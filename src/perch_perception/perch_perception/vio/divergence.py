@@ -1,4 +1,4 @@
-"""Whether the filter has diverged: what no filter that works tells of a vehicle."""
+"""Divergence check of the filter: values that a working filter never produces for a vehicle."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ _VELOCITY = 1.0  # largest 1 sigma of the velocity [m/s]
 
 
 def velocity_sigma(state: at.State) -> float:
-    """1 sigma of the velocity along the axis of W where it is known worst [m/s]."""
+    """Return 1 sigma of the velocity along its least certain axis of W [m/s]."""
     return float(np.sqrt(np.diag(state.P)[at.VELOCITY].max()))
 
 
 def divergence(state: at.State, used: int, refused: int, frames: int) -> str:
-    """Why the filter has to start again; empty: it works.
+    """Return the reason why the filter must restart; empty where it works.
 
     Args:
         state: of the filter.
-        used, refused: observations in the latest frames.
-        frames: their number.
+        used, refused: numbers of observations used and refused in the latest frames.
+        frames: number of these frames.
     """
     speed, gyro, accel = (float(np.linalg.norm(v)) for v in (state.v_WB, state.gyro_bias, state.accel_bias))
     if not np.isfinite(state.P).all() or not np.isfinite(state.p_WB).all():

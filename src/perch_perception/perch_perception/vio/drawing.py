@@ -1,4 +1,4 @@
-"""The debug image: features with the way they came."""
+"""Debug image: features with their trails."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _TAIL = 8  # frames
 
 
 class TrackPainter:
-    """Remembers where features were in the last frames; use it only while somebody watches."""
+    """Draws features with their trails over the last frames; to be called only while the debug image has a subscriber."""
 
     def __init__(self) -> None:
         self._tails: dict[int, list[np.ndarray]] = {}
@@ -22,7 +22,7 @@ class TrackPainter:
         Args:
             image: grey, uint8 (height, width).
             features: of this frame.
-            landmarks: numbers of those that are points in the filter's state: green; others are yellow, new ones red.
+            landmarks: numbers of the features that are landmarks in the filter's state: green; others are yellow, new ones red.
             caption: a line of text.
 
         Returns:

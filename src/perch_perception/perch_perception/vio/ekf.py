@@ -11,13 +11,13 @@ from scipy.linalg import lapack, qr
 
 
 class Gate:
-    """chi2 thresholds of one probability, kept by dimension."""
+    """chi2 thresholds of one probability, precomputed by dimension."""
 
     def __init__(self, probability: float, most: int = 400) -> None:
         self._limits = np.concatenate([[0.0], chi2_quantile(probability, np.arange(1, most + 1))])
 
     def limit(self, dimension: int) -> float:
-        """Largest normalised innovation squared of this dimension that passes."""
+        """Return the largest normalised innovation squared of this dimension that passes."""
         return float(self._limits[min(dimension, len(self._limits) - 1)])
 
 
@@ -31,7 +31,7 @@ def squared_distance(H: np.ndarray, P: np.ndarray, r: np.ndarray, variance: floa
 
 @compiled
 def _reflect(A, columns):
-    """Householder's QR of the first columns of A (m, n), applied to all of it in place."""
+    """Apply Householder QR of the first columns of A (m, n) to all of A in place."""
     m, n = A.shape
     v, w = np.zeros(m), np.zeros(n)
     for c in range(columns):
@@ -69,7 +69,7 @@ def _solve_lower(L: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def eliminate(H_x: np.ndarray, H_f: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Split r = H_x x + H_f f + n into a part that tells f and a part free of it, by an orthogonal transformation.
+    """Split r = H_x x + H_f f + n into a part that determines f and a part without f, by an orthogonal transformation.
 
     Args:
         H_x: shape (m, n); H_f: shape (m, 3); r: shape (m,); m > 3.
@@ -84,7 +84,7 @@ def eliminate(H_x: np.ndarray, H_f: np.ndarray, r: np.ndarray) -> tuple[np.ndarr
 
 
 def compress(H: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same information in at most n rows, by QR; H (m, n), r (m,)."""
+    """Reduce H (m, n), r (m,) to at most n rows with the same information, by QR."""
     if H.shape[0] <= H.shape[1]:
         return H, r
     R = qr(np.column_stack([H, r]), mode="r", check_finite=False)[0]
@@ -98,7 +98,7 @@ def update(P: np.ndarray, columns: np.ndarray, H: np.ndarray, r: np.ndarray,
 
     Args:
         P: covariance, shape (n, n).
-        columns: indices that H's columns stand for, shape (k,).
+        columns: indices in the error vector of H's columns, shape (k,).
         H: shape (m, k); r: shape (m,).
         variance: of the measurement noise, a number or one per row (m,).
 

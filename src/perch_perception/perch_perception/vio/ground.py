@@ -1,8 +1,8 @@
-"""Points of the ground as the first landmarks: a take-off begins with a scale.
+"""Ground points as the first landmarks, which give a take-off its scale.
 
-A vehicle that stands knows how high its camera is above the ground. Without that, the scale of the map comes from the first
-centimetres of the climb, flown on the IMU alone: from 13 cm above the floor a drift of 1 cm made the heights of whole flights
-wrong by 14 %. Where the camera stands so low that the ground is a blur, nothing is seen and nothing changes.
+The height of a standing vehicle's camera above the ground is known. Without this, the scale of the map results from the first
+centimetres of the climb, flown on the IMU alone: from 13 cm above the floor, a drift of 1 cm made the heights of whole flights
+wrong by 14 %. Where the camera stands so low that its image of the ground is blurred, no landmarks are added.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ _POSE = np.r_[0:6]   # theta, p
 
 
 def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float) -> int:
-    """Take points of the ground into the state of a vehicle that stands on it.
+    """Add ground points as landmarks to the state of a vehicle that stands on the ground.
 
-    A point is where its ray meets the plane z = floor. Two rows of its bearing's residual and one of the plane determine it:
-    [H_X; e3^T] dX = -[H_x; 0] dx + (n_b, n_f), which gives its covariance with the pose and the calibration.
+    A point lies where its ray intersects the plane z = floor. Two rows of its bearing's residual and one of the plane determine
+    it: [H_X; e3^T] dX = -[H_x; 0] dx + (n_b, n_f), which gives its covariance with the pose and the calibration.
 
     Args:
         filter: its state is that of the standing vehicle.
         ids: numbers of the features, shape (n,).
-        bearings: their bearings while it stood.
+        bearings: their bearings while the vehicle stood.
         floor: height of the ground in W [m].
 
     Returns:
-        How many points were taken in.
+        Number of landmarks added.
     """
     s, limits = filter.state, filter.config.filter
     centre = s.p_WB + s.R_WB @ s.p_BC

@@ -1,9 +1,9 @@
-"""The gyro's bias in motion, from tracks alone: relative rotations that make the epipolar normals of all tracks coplanar.
+"""Gyro bias in motion from tracks: relative rotations that make the epipolar normals of all tracks coplanar.
 
-Between frames i and j the preintegrated rotation is dR exp(J db) for a change db of the bias. Rays f_i, f_j of the same point, and the
-unknown translation t, obey t . n = 0 with n = f_i x dR exp(J db) f_j (Kneip and Lynen 2013). One db for all pairs and one t for
-each are the least-squares solution, by Gauss-Newton with the t eliminated (He et al., CVPR 2023: rotation without translation or depth).
-Neither scale nor gravity enters, so that it holds before there is a state.
+Between frames i and j the preintegrated rotation is dR exp(J db) for a change db of the bias. Rays f_i, f_j of the same point,
+and the unknown translation t, obey t . n = 0 with n = f_i x dR exp(J db) f_j (Kneip and Lynen 2013). One db for all pairs and one
+t for each pair are solved for by least squares: Gauss-Newton with t eliminated (He et al., CVPR 2023: rotation without
+translation or depth). Neither scale nor gravity enters, so the method works before there is a state.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ _ITERATIONS = 10
 
 @dataclass(frozen=True)
 class RayPair:
-    """Two frames.
+    """Rays of the same points in two frames.
 
     Attributes:
-        dR: rotation of the second in the first as preintegrated, shape (3, 3); J: its (right) derivative by the bias, shape (3, 3).
-        first, second: unit rays of the same points in B of each, shape (n, 3).
+        dR: preintegrated rotation of the second frame in the first, shape (3, 3); J: its (right) derivative with respect to the
+            bias, shape (3, 3).
+        first, second: unit rays of the same points in B of each frame, shape (n, 3).
     """
 
     dR: np.ndarray
@@ -33,12 +34,12 @@ class RayPair:
 
 
 def solve_gyro_bias(pairs: Sequence[RayPair], sigma: float, prior_sigma: float) -> tuple[np.ndarray, np.ndarray]:
-    """What the bias differs by from that of the preintegration.
+    """Return the correction of the bias that was used in the preintegration.
 
     Args:
-        pairs: no frame in more than one of them, so that each ray counts once.
+        pairs: no frame is in more than one of them, so that each ray counts once.
         sigma: 1 sigma of a ray [rad].
-        prior_sigma: 1 sigma of the bias as it was known [rad/s].
+        prior_sigma: prior 1 sigma of the bias [rad/s].
 
     Returns:
         db [rad/s], shape (3,), and its covariance, shape (3, 3).
@@ -48,7 +49,7 @@ def solve_gyro_bias(pairs: Sequence[RayPair], sigma: float, prior_sigma: float) 
 
 
 def _descend(pairs: Sequence[RayPair], sigma: float, prior_sigma: float, db: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Cost, bias and its covariance where Gauss-Newton from `db` (3,) ends."""
+    """Run Gauss-Newton from `db` (3,); return the final cost, bias correction and covariance."""
     for _ in range(_ITERATIONS):
         N, y, cost = np.eye(3) / prior_sigma**2, -db / prior_sigma**2, float(db @ db) / prior_sigma**2
         for pair in pairs:
@@ -75,7 +76,7 @@ def _descend(pairs: Sequence[RayPair], sigma: float, prior_sigma: float, db: np.
 
 
 def _translation(n: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
-    """The direction that is most nearly orthogonal to the normals (m, 3), shape (3,), and the plane across it, shape (3, 2)."""
+    """Return the direction most nearly orthogonal to normals (m, 3), shape (3,), and two axes orthogonal to it, shape (3, 2)."""
     length = (n**2).sum(axis=1)
     weighed = n / np.sqrt(length + (4.0 * sigma) ** 2)[:, None]
     _, vectors = np.linalg.eigh(weighed.T @ weighed)

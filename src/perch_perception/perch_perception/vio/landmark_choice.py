@@ -1,7 +1,7 @@
-"""Which points become landmarks: they are spread over the view.
+"""Selection of landmarks that are spread over the view.
 
-Points from the first moments of a take-off lie close together under the vehicle. A state full of them knows the
-height well and the heading hardly: in a hover the heading drifted by 0.1 deg/s with all 25 places taken.
+Points from the first moments of a take-off lie close together under the vehicle. A state full of them determines the height well
+but the heading poorly: in a hover the heading drifted by 0.1 deg/s with all 25 places taken.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ _CELLS = 16   # cells that a lens of 160 deg fills well
 
 
 def cell(b_C: np.ndarray) -> tuple[int, int]:
-    """Cell of the view in which a bearing (3,) lies, in equidistant coordinates."""
+    """Return the cell of the view in which a bearing (3,) lies, in equidistant coordinates."""
     rho = float(np.hypot(b_C[0], b_C[1]))
     scale = np.arctan2(rho, b_C[2]) / rho if rho > 1e-9 else 0.0
     return int(np.floor(b_C[0] * scale / _CELL)), int(np.floor(b_C[1] * scale / _CELL))
 
 
 class Spread:
-    """Landmarks by cell while new ones are taken in.
+    """Counts landmarks per cell of the view while new ones are added.
 
     Attributes:
         capacity: most landmarks.
-        quota: most in one cell while others want a place.
+        quota: number of landmarks at which a cell admits no more.
     """
 
     def __init__(self, landmarks: dict[int, np.ndarray], capacity: int) -> None:
@@ -46,7 +46,7 @@ class Spread:
         return len(self._cells) < self.capacity or self._most_crowded() > self.quota
 
     def add(self, number: int, b_C: np.ndarray) -> int | None:
-        """Add a landmark that was admitted; returns the one that has to go for it, if any."""
+        """Add an admitted landmark; return the number of the landmark to be dropped for it, if any."""
         victim = None
         if len(self._cells) >= self.capacity:
             worst = max(self._counts, key=lambda c: (self._counts[c], c))

@@ -1,4 +1,4 @@
-"""Bearings of many pixels at once and how they follow the lens, compiled."""
+"""Compiled bearings and local lens model of many pixels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from perch_core.lens import angle, radius_slope
 
 @compiled
 def _observe(lens, pixels, b, shape):
-    """Unit rays of pixels and the lens's shape there (`bearing.Bearings`); NaN where the lens sees nothing."""
+    """Fill unit rays `b` and lens model `shape` (`bearing.Bearings`) at pixels; NaN outside of the lens's image."""
     for n in range(pixels.shape[0]):
         x, y = (pixels[n, 0] - lens[2]) / lens[0], (pixels[n, 1] - lens[3]) / lens[1]
         r = math.sqrt(x * x + y * y)
@@ -24,7 +24,7 @@ def _observe(lens, pixels, b, shape):
 
 
 def observe(camera: EquidistantCamera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit rays in C of pixels (n, 2), shape (n, 3), and their `Bearings.shape`, shape (n, 2)."""
+    """Return unit rays in C of pixels (n, 2), shape (n, 3), and their `Bearings.shape`, shape (n, 2)."""
     b, shape = np.empty((len(pixels), 3)), np.empty((len(pixels), 2))
     _observe(camera.lens, np.ascontiguousarray(pixels, float), b, shape)
     return b, shape

@@ -1,12 +1,13 @@
 """Start in motion: gyro bias, gravity, velocity and scale from the IMU and the tracks of half a second or more, in closed form.
 
-First the gyro's bias, which a wrong rotation would carry into everything else (`gyro_bias`). Then, in the body frame B0 of the first
-frame, with preintegrated dR, dp and p_k = v0 T + g0 T^2/2 + dp_k + (d dp_k / d b_a) b_a, every observation says that the point lies on
-its ray:  (I - d d^T)(X_j - p_k - dR_k p_BC) = 0,  d = dR_k R_BC b.  That is linear in v0, g0, b_a and all X_j; the points are
-eliminated, b_a has its prior, and the 9 x 9 rest is solved with |g0| = g. (Dong-Si and Mourikis 2012.)
+The gyro's bias is solved for first, as a wrong rotation would distort everything else (`gyro_bias`). Then, in the body frame B0
+of the first frame, with preintegrated dR, dp and p_k = v0 T + g0 T^2/2 + dp_k + (d dp_k / d b_a) b_a, every observation requires
+that the point lies on its ray:  (I - d d^T)(X_j - p_k - dR_k p_BC) = 0,  d = dR_k R_BC b.  This is linear in v0, g0, b_a and all
+X_j; the points are eliminated, b_a has its prior, and the remaining 9 x 9 system is solved with |g0| = g. (Dong-Si and Mourikis
+2012.)
 
-That takes much for exact. From each of its minima `start_refinement` goes on with everything that is unknown; the likeliest end is the
-start, unless another is about as likely, or the scale is hardly known.
+The closed form takes many quantities as exact. From each of its minima `start_refinement` continues with all unknowns; the most
+likely result is the start, unless another is about as likely, or the scale is poorly known.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ _TILT, _SPEED = 0.2, 0.5  # 1 sigma with which a filter may start [rad, m/s]
 class MotionSolution:
     """Velocity and gravity in B0 and the accelerometer's bias (3,), covariance of all stacked (9, 9), and the RMS residual [rad].
 
-    The covariance is that of tracks twice as noisy as they are said to be.
+    The covariance assumes tracks with twice the given noise.
     """
 
     v: np.ndarray
@@ -66,24 +67,25 @@ class MotionSolution:
 
 def solve_motion(T: np.ndarray, dp: np.ndarray, dv: np.ndarray, by_bias: np.ndarray, centres: np.ndarray, rays: np.ndarray,
                  seen: np.ndarray, sigma: float, bias_sigma: float) -> list[MotionSolution]:
-    """Velocity, gravity and accelerometer bias from rays: maxima of their likelihood.
+    """Solve for velocity, gravity and accelerometer bias from rays: local maxima of the likelihood.
 
-    The closed form weighs a far point more than a near one, and so prefers a scale that is too small: it is where Gauss-Newton on the
-    bearings begins. Where it has collapsed, gravity along the mean force, and larger velocities, are better beginnings.
+    The closed form weights far points more than near ones, and so prefers a scale that is too small. It is therefore only the
+    initial guess of Gauss-Newton on the bearings. Where it collapses, gravity along the mean force, with larger velocities, is a
+    better guess.
 
     Args:
         T: time since the first frame [s], shape (n,).
         dp: preintegrated positions in B0 [m], shape (n, 3).
         dv: preintegrated velocity at the last of the frames in B0 [m/s], shape (3,).
-        by_bias: derivatives of dp by the accelerometer's bias, shape (n, 3, 3).
+        by_bias: derivatives of dp with respect to the accelerometer's bias, shape (n, 3, 3).
         centres: dR_k p_BC, camera centres relative to the body in B0 [m], shape (n, 3).
         rays: unit rays of m features in B0, shape (m, n, 3).
-        seen: in which frames they are, shape (m, n).
+        seen: whether a feature is seen in a frame, shape (m, n).
         sigma: 1 sigma of a ray [rad].
-        bias_sigma: 1 sigma of the accelerometer's bias before [m/s^2].
+        bias_sigma: prior 1 sigma of the accelerometer's bias [m/s^2].
 
     Returns:
-        Minima, the likeliest first; none where the motion does not tell velocity and gravity.
+        Solutions, the most likely first; none where the motion does not determine velocity and gravity.
     """
     G = np.concatenate([T[:, None, None] * np.eye(3), 0.5 * T[:, None, None] ** 2 * np.eye(3), by_bias], axis=2)
     along = dv * (-GRAVITY / max(float(np.linalg.norm(dv)), 1e-9))
@@ -98,8 +100,9 @@ def solve_motion(T: np.ndarray, dp: np.ndarray, dv: np.ndarray, by_bias: np.ndar
 
 def _refined(G: np.ndarray, e: np.ndarray, rays: np.ndarray, seen: np.ndarray, sigma: float, bias_sigma: float,
              gravity: np.ndarray | None, scale: float) -> tuple[float, MotionSolution] | None:
-    """Gauss-Newton from the closed form, with a given gravity (3,) in it and its velocity scaled, or with none; its cost and its end.
+    """Run Gauss-Newton from the closed form; return its cost and solution, or None where it fails.
 
+    The closed form uses a given gravity (3,) and multiplies its velocity by `scale`; without one it solves for gravity as well.
     Camera k is at G_k y + e_k, shapes (n, 3, 9), (n, 3), with y = (v, g, b_a).
     """
     u, distance = rays, np.ones(seen.shape)
@@ -141,7 +144,7 @@ def _refined(G: np.ndarray, e: np.ndarray, rays: np.ndarray, seen: np.ndarray, s
 
 
 def _with_gravity(N: np.ndarray, b: np.ndarray, g: np.ndarray | None = None) -> np.ndarray:
-    """Minimise y^T N y - 2 b^T y over (v, g, ...) with |g| = GRAVITY: Gauss-Newton on the sphere from a given g or the free solution."""
+    """Minimise y^T N y - 2 b^T y over (v, g, ...) with |g| = GRAVITY: Gauss-Newton on the sphere from g or the free solution."""
     if g is None:
         y = np.linalg.solve(N, b)
         g = y[3:6] if np.linalg.norm(y[3:6]) > 1e-6 else np.array([0.0, 0.0, -1.0])
@@ -157,10 +160,10 @@ def _with_gravity(N: np.ndarray, b: np.ndarray, g: np.ndarray | None = None) -> 
 
 
 class MotionStart:
-    """Gathers frames until they tell the gyro's bias, velocity and gravity.
+    """Collects frames until they determine the gyro's bias, velocity and gravity.
 
     Attributes:
-        gyro_bias: as far as it is known [rad/s], shape (3,).
+        gyro_bias: latest estimate [rad/s], shape (3,).
         gyro_sigma: 1 sigma of each of its components [rad/s].
     """
 
@@ -169,7 +172,7 @@ class MotionStart:
         Args:
             config: all settings.
             mount: the camera as calibrated.
-            gyro_bias: as a filter found it that was lost; None: there was none.
+            gyro_bias: estimate of an earlier filter [rad/s], shape (3,); None: there is none.
         """
         self._config, self._mount = config, mount
         self._tracks, self._next = Tracks(), 0
@@ -178,7 +181,7 @@ class MotionStart:
         self.gyro_sigma = config.imu.gyro_bias_init
 
     def add(self, frame: int, stamp: int, ids: np.ndarray, bearings: Bearings) -> None:
-        """Take a frame: number, exposure on the IMU's clock [ns], feature numbers (n,) and bearings."""
+        """Add a frame: number, exposure on the IMU's clock [ns], feature numbers (n,) and bearings."""
         self._tracks.take_ended(ids)
         self._tracks.observe(frame, ids, bearings)
         self._stamps[frame] = stamp
@@ -187,11 +190,11 @@ class MotionStart:
         self._tracks.forget_before(min(self._stamps))
 
     def solve(self, imu: ImuBuffer, known: Callable[[np.ndarray], KnownPose]) -> State | None:
-        """A state at the newest frame, or None while there is too little motion, time or texture.
+        """Return a state at the newest frame, or None while there is too little motion, time or texture.
 
         Args:
             imu: samples over all frames.
-            known: position and heading at the newest frame, as far as they are known, with a gyro bias (3,).
+            known: returns the known position and heading at the newest frame for a gyro bias (3,).
         """
         if max(self._stamps.values()) < self._next:
             return None
@@ -256,7 +259,7 @@ class MotionStart:
         return refine(self._config, self._mount, steps, sights, R_WB, R_WB @ end.v, self.gyro_bias, end.accel_bias, self._known_bias)
 
     def _sights(self, R_WB: np.ndarray, found: MotionSolution, parts: list[Preintegration], place: dict[int, int]) -> list[Sight]:
-        """Tracks with parallax, their points triangulated along the motion that was found."""
+        """Return the tracks with parallax, their points triangulated along the motion found."""
         R = np.array([R_WB @ p.dR for p in parts])
         p = np.array([found.v * p.duration + 0.5 * found.g * p.duration**2 + p.dp + p.J[3:6, 3:] @ found.accel_bias for p in parts]) @ R_WB.T
         centres, out = p + R @ self._mount.p_BC, []
@@ -273,7 +276,7 @@ class MotionStart:
         return sorted(out, key=lambda sight: -len(sight.frames))[:_MOST_POINTS]
 
     def _find_gyro_bias(self, frames: list[int], imu: ImuBuffer, rays: list[np.ndarray], seen: list[np.ndarray], sigma: float) -> None:
-        """From pairs of frames that are half the stretch apart, each frame in one of them."""
+        """Update the gyro's bias from pairs of frames half the stretch apart; no frame is in more than one pair."""
         half, pairs = len(frames) // 2, []
         for i in range(half):
             j = i + half
@@ -286,7 +289,7 @@ class MotionStart:
         self.gyro_bias, self.gyro_sigma = self.gyro_bias + step, largest_sigma(P)
 
     def _state(self, found: Refined, pose: KnownPose, stamp: int) -> State | None:
-        """The state at the end of the stretch, if it is known well enough: heading and position are the pose's."""
+        """Return the state at the end of the stretch, with heading and position of `pose`; None where it is too uncertain."""
         R_WB, v_B, P = start.levelled(pose.R_WB, found.R_WB[2]), found.v_B, found.covariance
         turned = R_WB @ so3.hat(v_B)
         if largest_sigma(P[:3, :3]) > _TILT or largest_sigma(P[3:6, 3:6]) > _SPEED:

@@ -1,7 +1,7 @@
 """The multi-state constraint Kalman filter with landmarks in the state. Mourikis and Roumeliotis 2007; Li and Mourikis 2013.
 
-Per frame: propagate with the IMU, clone the pose, update with landmarks that are still seen, take new landmarks into the
-state from tracks that span the window, then update with tracks that have ended (their point eliminated).
+Per frame: propagate with the IMU, clone the pose, update with landmarks that are still seen, make landmarks of tracks that
+span the window, then update with tracks that have ended (their point eliminated).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
 
 @dataclass
 class FrameReport:
-    """What a frame's update did: observations used and refused.
+    """Result of a frame's update: numbers of observations used and refused.
 
     Attributes:
-        nis, nis_dimension: normalised innovation squared of what was used, with its joint covariance, and its dimension.
+        nis, nis_dimension: normalised innovation squared of all that were used, with their joint covariance, and its dimension.
     """
 
     landmarks_used: int = 0
@@ -47,12 +47,12 @@ class FrameReport:
 
     @property
     def used(self) -> int:
-        """Observed features that changed the state."""
+        """Number of features that changed the state."""
         return self.landmarks_used + self.tracks_used + self.landmarks_new
 
 
 class Msckf:
-    """Owns the state. The caller feeds IMU steps and bearings; nothing here knows of images or ROS."""
+    """MSCKF that owns its state. The caller passes IMU steps and bearings; the filter depends on neither images nor ROS."""
 
     def __init__(self, config: VioConfig, state: State, focal_length: float) -> None:
         self.config, self.state = config, state
@@ -63,13 +63,13 @@ class Msckf:
         self._used: set[int] = set()  # features whose information is in the state already
 
     def propagate(self, rows: np.ndarray, stamp: int) -> None:
-        """Move the inertial state along IMU steps (m, 9) to a stamp [ns]."""
+        """Propagate the inertial state with IMU steps (m, 9) to a stamp [ns]."""
         if len(rows):
             propagate(self.state, rows, self.config.imu)
         self.state.stamp = stamp
 
     def add_frame(self, frame: int, ids: np.ndarray, bearings: Bearings) -> FrameReport:
-        """Clone the pose at a frame and update with what is seen in it.
+        """Clone the pose at a frame and update with the features seen in it.
 
         Args:
             frame: number, increasing.
@@ -93,7 +93,7 @@ class Msckf:
         return report
 
     def apply(self, columns: np.ndarray, H: np.ndarray, r: np.ndarray, variance: float | np.ndarray) -> float:
-        """Kalman update of the whole state with a Jacobian over some columns; returns the normalised innovation squared.
+        """Apply a Kalman update with a Jacobian over some columns to the whole state; return the normalised innovation squared.
 
         The lens is *considered*: its uncertainty counts in every gain and covariance, but it is not estimated (Schmidt).
         """
@@ -104,7 +104,7 @@ class Msckf:
         return nis
 
     def _use(self, report: FrameReport, columns: np.ndarray, rows: list[np.ndarray], rests: list[np.ndarray]) -> None:
-        """Update with the stacked rows of several observations; they are one innovation."""
+        """Update with the stacked rows of several observations, as one innovation."""
         H, r = ekf.compress(np.concatenate(rows), np.concatenate(rests))
         report.nis += self.apply(columns, H, r, self.sigma**2)
         report.nis_dimension += len(r)
@@ -112,7 +112,7 @@ class Msckf:
     # -- landmarks in the state --------------------------------------------------------------------------------------
 
     def _update_landmarks(self, report: FrameReport) -> None:
-        """Update with all landmarks seen in the newest frame; drop those that are not seen or refused again and again."""
+        """Update with all landmarks seen in the newest frame; drop those that are not seen or are refused repeatedly."""
         s = self.state
         s.drop_landmarks({i for i in s.landmarks if i not in self.tracks.by_id})
         if not s.landmarks:
@@ -148,7 +148,7 @@ class Msckf:
         s.drop_landmarks(bad)
 
     def _spanning(self) -> dict[int, Track]:
-        """Tracks that span the whole window and are not in the state, those with parallax, most parallax first."""
+        """Return the tracks with parallax that span the whole window and are not in the state, most parallax first."""
         s, limits = self.state, self.config.filter
         oldest = s.clones[0].frame
         return self._with_parallax({
@@ -156,7 +156,7 @@ class Msckf:
             and t.frames[0] == oldest and len(t.frames) >= limits.clones - 1})
 
     def _spend(self, spanning: dict[int, Track]) -> dict[int, Track]:
-        """Use spanning tracks that found no place as landmarks as if they had ended here; they begin anew."""
+        """Remove and return spanning tracks that did not become landmarks, to be used as if ended; their features restart."""
         spent: dict[int, Track] = {}
         for i in spanning:
             if i not in self.state.landmarks and len(spent) < _MOST_TRACKS:
@@ -165,7 +165,7 @@ class Msckf:
         return spent
 
     def _take_in_landmarks(self, spanning: dict[int, Track], report: FrameReport) -> None:
-        """Make landmarks of spanning tracks where the view has room for them."""
+        """Make spanning tracks landmarks where the view has room for them."""
         s, limits = self.state, self.config.filter
         if limits.landmarks == 0:
             return
@@ -225,7 +225,7 @@ class Msckf:
             self._use(report, columns, rows, rests)
 
     def _prepare_some(self, tracks: dict[int, Track], size: int, report: FrameReport) -> Iterator[tuple[int, tuple | None]]:
-        """`_prepare` by number, a few at a time as they are asked for."""
+        """Yield feature numbers with their results of `_prepare`, computed on demand for `size` tracks at a time."""
         ids = list(tracks)
         for begin in range(0, len(ids), size):
             chunk = ids[begin : begin + size]
@@ -234,7 +234,7 @@ class Msckf:
     def _prepare(self, tracks: list[Track], report: FrameReport) -> list[tuple | None]:
         """Triangulate tracks and linearise their observations over calibration and window (`_window_columns`).
 
-        Rays with parallax that meet in no point are refused observations: of something that moves, or by poses that are wrong.
+        Rays with parallax that do not intersect count as refused observations: the point moves, or the poses are wrong.
 
         Returns:
             For each track: X_W (3,), H_x (2m, k), H_f (2m, 3), r (2m,); None where it is not usable.
@@ -283,7 +283,7 @@ class Msckf:
         return np.arange(at.INERTIAL_SIZE, self.state.landmark_start)
 
     def _with_parallax(self, tracks: dict[int, Track]) -> dict[int, Track]:
-        """Tracks whose first and last rays in W differ enough to be worth a triangulation, most parallax first."""
+        """Return the tracks whose first and last rays in W differ enough for a triangulation, most parallax first."""
         if not tracks:
             return {}
         s = self.state
@@ -297,7 +297,7 @@ class Msckf:
         return {ids[k]: tracks[ids[k]] for k in order if ends[k] < enough}
 
     def _let_slide(self, tracks: list[Track], distance: np.ndarray) -> None:
-        """The walk of all landmarks since the last frame (`sliding`), seen now from distances [m], shape (n,)."""
+        """Add the walk of all landmarks since the last frame (`sliding`) to P; `distance`: from the camera [m], shape (n,)."""
         s = self.state
         if len(s.clones) < 2:
             return

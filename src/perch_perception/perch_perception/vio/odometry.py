@@ -1,7 +1,7 @@
 """Visual-inertial odometry: IMU samples and images in, poses with covariance out. [M:IV-B]
 
-Ties tracker and filter together and decides what a frame is for: waiting for a start, standing still, tracking, blind, or
-lost. Free of ROS; the same inputs give the same outputs.
+Connects tracker and filter and decides the outcome of each frame: waiting for a start, standing still, tracking, blind, or
+lost. Independent of ROS; the same inputs give the same outputs.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _INERTIAL = np.r_[at.POSITION, at.VELOCITY, at.THETA, at.GYRO_BIAS, at.ACCEL_BIA
 
 
 class VisualInertialOdometry:
-    """Owns tracker, filter and IMU history.
+    """Visual-inertial odometry: owns tracker, filter and IMU history.
 
-    Call `add_imu` with every sample; call `add_image` once `covers(stamp)` says that the IMU has passed the exposure.
+    Call `add_imu` with every sample, and `add_image` once `covers(stamp)` is true: the IMU has then passed the exposure.
     """
 
     def __init__(self, config: VioConfig, mount: CameraMount, p_WB: np.ndarray = np.zeros(3), yaw: float = 0.0,
@@ -54,7 +54,7 @@ class VisualInertialOdometry:
             mount: the camera as calibrated.
             p_WB: position of the body in W at the start [m], shape (3,).
             yaw: of the body in W at the start [rad].
-            floor: height in W of the level ground that it stands on [m]; None: unknown.
+            floor: height in W of the level ground under the vehicle [m]; None: unknown.
         """
         self.config = config
         self.filter: Msckf | None = None
@@ -84,7 +84,7 @@ class VisualInertialOdometry:
         _compile(mount.camera)
 
     def use_camera(self, mount: CameraMount) -> None:
-        """Go on with another camera, or another calibration of it: a filter that flies starts again in motion."""
+        """Switch to another camera or calibration: a filter in flight is dropped and restarted in motion."""
         if self._resting:
             self._know()
             self.filter, self._resting = None, False  # nothing is lost: it still stands there
@@ -96,7 +96,7 @@ class VisualInertialOdometry:
         self._look_through(mount)
 
     def _await(self) -> None:
-        """Gather frames for a start in motion from now on."""
+        """Begin to collect frames for a start in motion."""
         self._moving = motion_start.MotionStart(self.config, self.mount, None if self._biases is None else self._biases[0][:3])
         # rotation since the pose was known, by the gyro less a bias, and its derivative by that
         self._turned, self._turned_bias = (np.eye(3), np.zeros((3, 3))), self._moving.gyro_bias
@@ -112,26 +112,26 @@ class VisualInertialOdometry:
         return self.filter.state.time_offset if self.filter else -self.mount.stamp_offset
 
     def covers(self, stamp: int) -> bool:
-        """Whether the IMU has passed the exposure of an image with this stamp [ns], or the stamp cannot be waited for."""
+        """Whether the IMU has passed the exposure of an image with this stamp [ns], or the stamp is too far ahead to wait for."""
         newest = self._imu.last.stamp if self._imu.last else None
         exposed = stamp + round(self.time_offset * 1e9)
         return newest is not None and (exposed <= newest or exposed > newest + _FUTURE)
 
     @property
     def _running(self) -> Msckf:
-        """The filter, from a start on."""
+        """The filter, which must have been started."""
         assert self.filter is not None
         return self.filter
 
     def add_imu(self, sample: ImuSample) -> ImuOutcome:
-        """Keep a sample; bad ones are bridged or refused, see `ImuOutcome`."""
+        """Store a sample; bad ones are bridged or refused, see `ImuOutcome`."""
         return self._imu.add(sample)
 
     def add_image(self, stamp: int, image: np.ndarray) -> VioResult:
-        """Use a frame.
+        """Process a frame.
 
         Args:
-            stamp: of the board [ns].
+            stamp: of the image, on the camera's clock [ns].
             image: grey, uint8 (height, width).
         """
         exposed = stamp + round(self.time_offset * 1e9)
@@ -163,9 +163,9 @@ class VisualInertialOdometry:
         return FrameOutcome.TOO_OLD if exposed < self._imu.oldest else None
 
     def _resume(self) -> None:
-        """Images have stopped for longer than the IMU is remembered: start again from what was known.
+        """Restart from the last known pose after a gap in the images that is longer than the IMU history.
 
-        What rested is taken to rest there still. What moved may have turned by any angle.
+        A vehicle at rest is assumed to rest there still. One in motion may have turned by any angle.
         """
         moved = self._lost is not None or (self.filter is not None and not self._resting)
         if self.filter is not None:
@@ -198,7 +198,7 @@ class VisualInertialOdometry:
     # -- before the start --------------------------------------------------------------------------------------------
 
     def _try_start(self, exposed: int, features: Features) -> VioResult:
-        """Start at rest or, when the vehicle moves, from the frames of the last half second and more."""
+        """Start at rest or, when the vehicle moves, from the frames of the last half second or more."""
         steps = window(self._imu, exposed)
         biases, variance = self._biases or (None, None)
         if self._seen.still() is not False and still(steps, biases, variance, bool(self._seen.still(STANDS))):
@@ -214,7 +214,7 @@ class VisualInertialOdometry:
         return VioResult(outcome, None, len(features.ids), restarts=self.restarts, message=outcome.value)
 
     def _known_with(self, gyro_bias: np.ndarray) -> KnownPose:
-        """What is known of the present pose, with the heading carried on by a gyro with this bias."""
+        """Return the known present pose, with the heading propagated by the gyro less this bias."""
         dR, J = self._turned
         return replace(self._known, R_WB=self._known.R_WB @ dR @ so3.exp(J @ (gyro_bias - self._turned_bias)))
 
@@ -247,9 +247,9 @@ class VisualInertialOdometry:
         return self._judge(exposed, features, report)
 
     def _is_still(self, exposed: int) -> bool:
-        """Whether the vehicle rests: the IMU says so, nothing moves in the image, and it is not known to move steadily.
+        """Whether the vehicle rests: the IMU is quiet, nothing moves in the image, and the filter's velocity may be zero.
 
-        While vision says where the vehicle is, nobody asks: a very quiet hover looks like rest.
+        False until `_DARK` after a visual update: a very quiet hover looks like rest.
         """
         state = self._running.state
         if self._sight is not None and exposed - self._sight < round(1e9 * _DARK):
@@ -260,10 +260,10 @@ class VisualInertialOdometry:
                           seen=bool(quiet) and (self._resting or bool(self._seen.still(STANDS)))))
 
     def _hold(self, exposed: int, features: Features) -> VioResult:
-        """Tell the filter that the vehicle stood still, up to a little before now.
+        """Update the filter with rest, up to `_REST_LAG` before the exposure.
 
-        A take-off is noticed some time after it began. The filter stays behind by `_REST_LAG`, so that what it was told
-        remains true, and catches up with the IMU when the vehicle leaves. What is said of now is its state and the IMU since.
+        A take-off is detected some time after its beginning. Due to the lag, the rest applied so far remains true, and the filter
+        catches up with the IMU when the vehicle leaves. The result at the exposure is its state propagated by the IMU since.
         """
         filter, state = self._running, self._running.state
         until = max(state.stamp, exposed - round(_REST_LAG * 1e9))
@@ -282,7 +282,7 @@ class VisualInertialOdometry:
         return self._result(FrameOutcome.RESTING, features, FrameReport(), rest.moved_on(filter, self._imu.run(until, exposed), exposed, shaken))
 
     def _stand_on(self, floor: float, features: Features) -> None:
-        """What was seen of the ground while the vehicle stood, and still is, becomes its first landmarks."""
+        """Make ground features that were seen at rest, and still are, the first landmarks."""
         exposed, view = self._views[0]
         if exposed > self._running.state.stamp:
             return
@@ -291,12 +291,12 @@ class VisualInertialOdometry:
         ground.take_in(self._running, view.ids[known], self._observe(view).chosen(known), floor)
 
     def _observe(self, features: Features) -> Bearings:
-        """Bearings; 1 sigma of each is the declared `pixel_noise` or, where that is larger, what the image's noise makes of its patch."""
+        """Return bearings; 1 sigma of each is the larger of the configured `pixel_noise` and the patch fit's by image noise."""
         return replace(observe(self.mount.camera, features.pixels),
                        noise=np.maximum(features.sigma / self.config.filter.pixel_noise, 1.0))
 
     def _judge(self, exposed: int, features: Features, report: FrameReport) -> VioResult:
-        """Whether the filter still sees, or has to start again."""
+        """Return the frame's result, after a check for divergence and for missing visual updates."""
         s = self._running.state
         if report.used:
             self._informed = exposed
@@ -314,7 +314,7 @@ class VisualInertialOdometry:
         return self._result(outcome, features, report)
 
     def _lose(self, features: Features, why: str) -> VioResult:
-        """Keep what is known of position and heading, and start again in motion."""
+        """Store the known position and heading, and restart in motion."""
         self._forget_state()
         return VioResult(FrameOutcome.LOST, None, len(features.ids), restarts=self.restarts, message=f"lost: {why}")
 
@@ -327,7 +327,7 @@ class VisualInertialOdometry:
         self.filter, self._resting, self._told, self.restarts = None, False, False, self.restarts + 1
 
     def _know(self) -> None:
-        """Keep what a new start needs."""
+        """Store the pose and biases for a new start, unless they are not finite."""
         s = self._running.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
             rows = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
@@ -335,7 +335,7 @@ class VisualInertialOdometry:
             self._biases = _biases(s)
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport, now: at.State | None = None) -> VioResult:
-        """What became of a frame; `now`: the state at its exposure, None: the filter's."""
+        """Return a frame's result; `now`: the state at its exposure; None: the filter's state."""
         s = self._running.state if now is None else now
         return VioResult(outcome, _estimate(s) if outcome.has_pose else None, len(features.ids), report.used, report.refused,
                          report.nis, report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
@@ -347,12 +347,12 @@ def _estimate(s: at.State) -> VioPoseEstimate:
 
 
 def _biases(state: at.State) -> tuple[np.ndarray, np.ndarray]:
-    """Biases of gyro and accelerometer, and their variances, shape (6,)."""
+    """Return the biases of gyro and accelerometer, and their variances, shape (6,)."""
     return np.concatenate([state.gyro_bias, state.accel_bias]), np.diag(state.P)[9:15].copy()
 
 
 def _compile(camera: Camera) -> None:
-    """Run the compiled parts once: on a new machine that takes seconds, which no flight should wait for."""
+    """Run the compiled functions once: their first compilation takes seconds, which must not happen in flight."""
     row = np.array([[0.002, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-4, 0.1]])
     preintegrate(row, np.zeros(3), np.zeros(3))
     rays = np.array([[0.0, 0.0, -1.0], [-0.6, 0.0, -0.8]])

@@ -1,4 +1,4 @@
-"""IMU steps between two frames, integrated once: motion, its derivatives by the biases, and the noise it gathers.
+"""Preintegration of the IMU steps between two frames: motion, its derivatives with respect to the biases, and its noise.
 
 Forster et al., On-Manifold Preintegration: with R, v, p at the start,
     R' = R dR,   v' = v + g T + R dv,   p' = p + v T + g T^2/2 + R dp.
@@ -21,8 +21,8 @@ class Preintegration:
     Attributes:
         duration: T [s].
         dR: shape (3, 3); dv [m/s], dp [m]: shape (3,), in the axes of B at the start.
-        J: derivative of (log dR (right), dp, dv) by (b_g, b_a), shape (9, 6).
-        Q: covariance of the same from IMU noise, shape (9, 9).
+        J: derivative of (log dR (right), dp, dv) with respect to (b_g, b_a), shape (9, 6).
+        Q: covariance of (log dR (right), dp, dv) from IMU noise, shape (9, 9).
         w_end: angular velocity of the last step, bias removed [rad/s], shape (3,).
     """
 
@@ -40,7 +40,7 @@ class Preintegration:
 
 @compiled
 def _rotation(x, y, z, R, right):
-    """exp of a rotation vector into R, its right Jacobian into `right`, both (3, 3)."""
+    """Write exp of a rotation vector to `R` and its right Jacobian to `right`, both (3, 3)."""
     a2 = x * x + y * y + z * z
     a = math.sqrt(a2)
     if a < 1e-4:
@@ -64,7 +64,7 @@ def _rotation(x, y, z, R, right):
 
 @compiled
 def _product(A, B, out):
-    """out = A B for small matrices; out is neither A nor B."""
+    """Compute out = A B for small matrices; `out` is neither A nor B."""
     for i in range(A.shape[0]):
         for j in range(B.shape[1]):
             total = 0.0

@@ -1,4 +1,4 @@
-"""The inertial state and its covariance along IMU steps."""
+"""Propagation of the inertial state and its covariance with IMU steps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _G = np.array([0.0, 0.0, -GRAVITY])
 
 
 def propagate(s: State, rows: np.ndarray, imu: ImuNoise) -> None:
-    """Move the inertial part of a state along IMU steps (m, 9), m > 0; its stamp is left to the caller."""
+    """Propagate the inertial part of a state with IMU steps (m, 9), m > 0; the caller sets its stamp."""
     pre = preintegrate(rows, s.gyro_bias, s.accel_bias)
     T, R = pre.duration, s.R_WB
     p = s.p_WB + s.v_WB * T + 0.5 * _G * T * T + R @ pre.dp
@@ -44,5 +44,5 @@ def propagate(s: State, rows: np.ndarray, imu: ImuNoise) -> None:
 
 
 def _orthonormal(R: np.ndarray) -> np.ndarray:
-    """The rotation nearest to a matrix that rounding has taken off SO(3): one step of Newton's method."""
+    """Return the rotation nearest to a matrix that rounding has moved off SO(3): one step of Newton's method."""
     return 1.5 * R - 0.5 * R @ (R.T @ R)

@@ -1,4 +1,4 @@
-"""Whether anything has moved in the image lately, whatever the gyro says."""
+"""Detection of motion in the recent images, independent of the gyro."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ class RecentViews:
         self._views: deque[tuple[int, Features]] = deque()  # (exposed [ns], features)
 
     def clear(self) -> None:
-        """Forget them: the camera is another one."""
+        """Discard all frames, e.g. after a change of the camera."""
         self._views.clear()
 
     def add(self, exposed: int, features: Features) -> None:
-        """Keep a frame, exposed at a time [ns]."""
+        """Add a frame, exposed at a time [ns]."""
         self._views.append((exposed, features))
         while len(self._views) > 2 and self._views[1][0] <= exposed - round(1e9 * STANDS):
             self._views.popleft()
 
     def still(self, duration: float = WINDOW) -> bool | None:
-        """Whether nothing has moved for so long [s]; None where there is nothing in the image.
+        """Whether nothing has moved for a duration [s]; None where the image has too few tracks.
 
-        A hover, too, stands still for the duration in which rest is judged, which is the default: it is not for the image alone to say.
+        The default is the duration over which rest is judged. A hover, too, can be still for so long: the image alone does not
+        prove rest.
         """
         until, now = self._views[-1]
         since, then = next(((t, f) for t, f in reversed(self._views) if t <= until - round(1e9 * _MOST * duration)), self._views[0])

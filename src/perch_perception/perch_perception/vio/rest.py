@@ -1,7 +1,7 @@
-"""The MSCKF at rest, as the UKF is (`perch_perception.ukf.rest`): pose constant, velocity zero, biases seen directly.
+"""Updates of the MSCKF at rest, as in the UKF (`perch_perception.ukf.rest`): constant pose, zero velocity, observed biases.
 
-On the ground, on a wall and on a wire the downward camera looks at a few square centimetres from 2-5 cm, or into the dark. Nothing
-can be triangulated there, but nothing moves either. How rest is recognised: `perch_perception.ukf.stillness`.
+On the ground, on a wall and on a wire the downward camera sees a few square centimetres from 2-5 cm, or darkness. Nothing can
+be triangulated there, but nothing moves either. Rest is detected by `perch_perception.ukf.stillness`.
 """
 
 from __future__ import annotations
@@ -24,22 +24,25 @@ _BIASES = np.r_[9:15]
 
 
 def can_stand(state: at.State) -> bool:
-    """Whether zero lies within what the filter knows of its velocity (chi2): a slow, steady flight is as quiet as the ground."""
+    """Whether the filter's velocity is consistent with zero (chi2): to the IMU, slow, steady flight is as quiet as rest."""
     v = state.v_WB
     return bool(v @ np.linalg.solve(state.P[at.VELOCITY, at.VELOCITY], v) < _STANDS)
 
 
 def stop(filter: Msckf) -> None:
-    """The vehicle has come to rest at the state's stamp: what its velocity was wrong by, it was wrong by before."""
+    """Apply zero velocity at the state's stamp, when the vehicle comes to rest, and drop all clones.
+
+    The velocity's error is older than the stop, so the update corrects all that is correlated with it.
+    """
     s = filter.state
     s.drop_clones(list(range(len(s.clones))))
     filter.apply(np.r_[at.VELOCITY], np.eye(3), -s.v_WB, REST_VELOCITY**2)
 
 
 def hold(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> None:
-    """The vehicle has rested over IMU steps (m, 9), m > 0, up to their end `stamp` [ns].
+    """Update for a vehicle at rest over IMU steps (m, 9), m > 0, up to their end `stamp` [ns].
 
-    w_mean = b_g + n_w,   f_mean = b_a + R^T g + n_f;  n has `shaken` times the variance of the sensor's noise.
+    w_mean = b_g + n_w,   f_mean = b_a + R^T g + n_f;  the variance of n is `shaken` times that of the sensor's noise.
     """
     s, imu = filter.state, filter.config.imu
     T = float(steps[:, DT].sum())
@@ -58,10 +61,10 @@ def hold(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> None:
 
 
 def moved_on(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> at.State:
-    """The inertial state at a later stamp [ns], by the IMU steps (m, 9) since the filter's; the filter stays where it is.
+    """Return the inertial state propagated to a later stamp [ns] by IMU steps (m, 9) since the filter's; `filter` is unchanged.
 
-    A departure that nobody has noticed yet is in these steps: "at rest" said of now is wrong by 10 cm/s when it is noticed.
-    `shaken` as in `hold`.
+    These steps contain the beginning of a take-off before it is detected: at its detection, a velocity of zero would be wrong by
+    10 cm/s. `shaken` as in `hold`.
     """
     n = at.INERTIAL_SIZE
     state = replace(filter.state, stamp=stamp, P=filter.state.P[:n, :n].copy(), clones=[], landmarks={})

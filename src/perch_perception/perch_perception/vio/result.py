@@ -1,4 +1,4 @@
-"""What visual-inertial odometry says of each frame."""
+"""Result of visual-inertial odometry for each frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from perch_perception.ukf.odometry import covariances
 
 
 class FrameOutcome(enum.Enum):
-    """What became of a frame."""
+    """Outcome of a frame."""
 
     INITIALISING = "waiting for a start at rest or in motion"
     RESTING = "standing still"
@@ -27,7 +27,7 @@ class FrameOutcome(enum.Enum):
 
     @property
     def has_pose(self) -> bool:
-        """Whether a pose comes with it."""
+        """Whether the frame has a pose."""
         return self in (FrameOutcome.RESTING, FrameOutcome.LEAVING, FrameOutcome.TRACKING)
 
 
@@ -71,11 +71,11 @@ class VioResult:
     Attributes:
         outcome: see `FrameOutcome`.
         estimate: None where the outcome has no pose.
-        features: tracked features; used, refused: observations that changed the state and that the gate refused.
-        nis, nis_dimension: normalised innovation squared of all observations together, and its dimension.
+        features: tracked features; used, refused: observations that changed the state, and those that were refused.
+        nis, nis_dimension: normalised innovation squared of all used observations together, and its dimension.
         blind_for: time since the last visual or rest update [s].
-        restarts: starts after the first.
-        message: for people.
+        restarts: number of times that the filter was lost.
+        message: human-readable outcome.
     """
 
     outcome: FrameOutcome

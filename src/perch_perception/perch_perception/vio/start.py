@@ -1,4 +1,4 @@
-"""The filter's first state, at rest: tilt by gravity, gyro bias from the mean, position and heading as known."""
+"""Initial state of the filter at rest: tilt from gravity, gyro bias from the mean rate, position and heading as known."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TOLD_SIGMA = (0.001, 0.001, 0.001, 0.001)
 
 @dataclass(frozen=True)
 class KnownPose:
-    """Position and attitude in W at a start: of the attitude only the heading counts, gravity says the rest.
+    """Known position and attitude in W at a start: only the heading of the attitude is used; gravity gives the tilt.
 
     Attributes:
         p_WB: [m], shape (3,).
@@ -38,12 +38,12 @@ class KnownPose:
 
 
 def told(p_WB: np.ndarray, yaw: float) -> KnownPose:
-    """The pose at the start as somebody gives it: position [m], shape (3,), and yaw [rad]."""
+    """Return the pose at the start from a configured position [m], shape (3,), and yaw [rad]."""
     return KnownPose(np.array(p_WB, float), so3.exp(np.array([0.0, 0.0, yaw])), np.diag(np.square(TOLD_SIGMA)))
 
 
 def levelled(R_WB: np.ndarray, up_B: np.ndarray) -> np.ndarray:
-    """The attitude nearest to R_WB in which a direction in B, shape (3,), points up."""
+    """Return the attitude nearest to R_WB in which a direction in B, shape (3,), points up."""
     up_W = R_WB @ (up_B / np.linalg.norm(up_B))
     axis = np.array([up_W[1], -up_W[0], 0.0])  # up_W x e3
     sine = float(np.linalg.norm(axis))
@@ -54,7 +54,7 @@ def levelled(R_WB: np.ndarray, up_B: np.ndarray) -> np.ndarray:
 
 def fresh(config: VioConfig, mount: CameraMount, stamp: int, R_WB: np.ndarray, pose: KnownPose, v_WB: np.ndarray,
           gyro_bias: np.ndarray, tilt_sigma: float, velocity_sigma: float, gyro_sigma: float) -> State:
-    """A state without clones; attitude uncertainty is `tilt_sigma` about the horizontal axes and the pose's about z."""
+    """Return a state without clones; attitude uncertainty is `tilt_sigma` about the horizontal axes and the pose's about z."""
     c = config.calibration
     P = np.zeros((at.CORE_SIZE, at.CORE_SIZE))
     # theta = R^T (tilt_x, tilt_y, yaw): the pose's covariance couples yaw and position
@@ -73,9 +73,9 @@ def fresh(config: VioConfig, mount: CameraMount, stamp: int, R_WB: np.ndarray, p
 
 
 def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray, pose: KnownPose) -> State:
-    """State of a vehicle that stood still over IMU steps (m, 9).
+    """Return the state of a vehicle that stood still over IMU steps (m, 9).
 
-    Tilt and accelerometer bias cannot be told apart at rest: the update with the mean force leaves exactly that correlation.
+    Tilt and accelerometer bias cannot be separated at rest: the update with the mean force yields exactly this correlation.
     """
     gyro, accel = steps[:, GYRO].mean(axis=0), steps[:, ACCEL].mean(axis=0)
     R_WB = levelled(pose.R_WB, accel)
@@ -95,7 +95,7 @@ def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray
 
 
 def carry(state: State, since: Preintegration) -> None:
-    """Move the position of a start on from where it was known, by the IMU since and the velocity and attitude of the start.
+    """Propagate the position of a start from where it was last known, by the IMU since and the start's velocity and attitude.
 
     With p' = p + v T + g T^2/2 + R dp, v' = v + g T + R dv and R = R' dR^T of the start (R', v', p'):
     p' - p = v' T - g T^2/2 - R' u,  u = dR^T (T dv - dp).

@@ -1,10 +1,10 @@
-"""A start in motion as a maximum a posteriori: everything that is unknown at once, each with its own noise or prior.
+"""Maximum a posteriori refinement of a start in motion: all unknowns at once, each with its own noise or prior.
 
-The closed form (`motion_start`) takes the gyro's bias, the calibration and the IMU's readings for exact. Over half a second 5 mrad/s are
-2 px, as much as the parallax by which the scale is known: what it finds may be wrong by several of its sigmas. From where it ends,
-Gauss-Newton goes on over tilt, velocity and biases at the first frame, the camera's calibration and the noise of each preintegrated
-interval, the points eliminated (Geneva and Huang, OpenVINS State Initialization, 2022; Campos, Montiel and Tardos 2019). The inverse of
-its information is the covariance with which the filter starts, with all correlations.
+The closed form (`motion_start`) takes the gyro's bias, the calibration and the IMU's readings as exact. Over half a second an
+error of 5 mrad/s is 2 px, as much as the parallax that determines the scale: the result may be wrong by several of its sigmas.
+From there, Levenberg-Marquardt continues over tilt, velocity and biases at the first frame, the camera's calibration and the
+noise of each preintegrated interval, with the points eliminated (Geneva and Huang, OpenVINS State Initialization, 2022; Campos,
+Montiel and Tardos 2019). The inverse of its information is the covariance with which the filter starts, with all correlations.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _TIME_OFFSET = _CALIBRATION.start + 6
 
 @dataclass(frozen=True)
 class Sight:
-    """One point: the frames, by their place in the stretch, that have seen it, shape (m,), its bearings and where it is in W, shape (3,)."""
+    """Observations of a point: indices of the frames in the stretch, shape (m,), bearings, and position in W, shape (3,)."""
 
     frames: np.ndarray
     bearings: Bearings
@@ -49,18 +49,18 @@ class Sight:
 
 @dataclass(frozen=True)
 class Refined:
-    """The state at the newest frame.
+    """Refined state at the newest frame.
 
     Attributes:
         R_WB: gravity is along -z of W; the heading is that of the first frame's guess, shape (3, 3).
         v_B: velocity in B [m/s], shape (3,).
         gyro_bias, accel_bias: [rad/s], [m/s^2], shape (3,).
-        R_BC, p_BC, time_offset: the camera, and by what its clock differs from that of the stamps [s].
+        R_BC, p_BC, time_offset: the camera's extrinsics, and the correction of its time offset [s].
         covariance: of (theta across up, v_B, b_g, b_a, camera rotation and position, time offset, lens), shape (23, 23).
-        misfit: chi^2 of all that was used over its degrees of freedom.
+        misfit: chi^2 of all observations used, and of the priors, over the degrees of freedom.
         kept: share of the points that fit.
         scale: 1 sigma of the mean logarithm of the points' distances.
-        cost: chi^2 of everything, points that do not fit at the limit.
+        cost: chi^2 of all points and priors; a point that does not fit counts with the gate's limit.
     """
 
     R_WB: np.ndarray
@@ -77,14 +77,14 @@ class Refined:
     cost: float
 
     def differs_from(self, other: Refined) -> bool:
-        """Whether tilt or velocity are another's, by more than what either says of itself."""
+        """Whether tilt or velocity differ from those of another by more than both covariances explain."""
         d = np.concatenate([np.cross(self.R_WB[2], other.R_WB[2]), self.v_B - other.v_B])
         return bool(d @ np.linalg.solve(self.covariance[:6, :6] + other.covariance[:6, :6] + 1e-6 * np.eye(6), d) > _DIFFERENT)
 
 
 @dataclass
 class _Unknowns:
-    """Where Gauss-Newton is: state at the first frame, camera, noise of the intervals and points."""
+    """Current values of the unknowns: state at the first frame, camera, noise of the intervals and points."""
 
     R_WB: np.ndarray
     v_WB: np.ndarray
@@ -97,7 +97,7 @@ class _Unknowns:
 
 @dataclass(frozen=True)
 class _Motion:
-    """Poses and velocities of all frames, (n, 3, 3), (n, 3), (n, 3), and their derivative (n, 9, k); the rates [rad/s], (n, 3)."""
+    """Poses and velocities of all frames, (n, 3, 3), (n, 3), (n, 3), their derivative (n, 9, k), and rates [rad/s], (n, 3)."""
 
     R_WB: np.ndarray
     p_WB: np.ndarray
@@ -108,7 +108,7 @@ class _Motion:
 
 @dataclass(frozen=True)
 class _Linear:
-    """Normal equations N dz = b, what the points' steps follow from (R_f, H_1, r_1), chi^2 of each point, its degrees of freedom, the cost."""
+    """Normal equations N dz = b, terms of the points' steps (R_f, H_1, r_1), their chi^2 and degrees of freedom, and the cost."""
 
     motion: _Motion
     N: np.ndarray
@@ -121,20 +121,20 @@ class _Linear:
 
 def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], sights: Sequence[Sight], R_WB: np.ndarray, v_WB: np.ndarray,
            gyro_bias: np.ndarray, accel_bias: np.ndarray, known_bias: np.ndarray) -> Refined | None:
-    """The likeliest state, from a first guess.
+    """Return the most likely state, from an initial guess.
 
     Args:
         config: all settings.
         mount: the camera as calibrated.
         steps: IMU steps (m, 9) between neighbouring frames, one for each interval.
-        sights: what the frames have seen, the points in W at the first frame's position.
+        sights: observed points, in W with its origin at the first frame's position.
         R_WB: attitude at the first frame, level by gravity, shape (3, 3).
         v_WB: velocity there [m/s], shape (3,).
-        gyro_bias, accel_bias: where to begin, shape (3,).
-        known_bias: the gyro's bias about which its prior is, shape (3,).
+        gyro_bias, accel_bias: initial guess, shape (3,).
+        known_bias: mean of the gyro bias's prior, shape (3,).
 
     Returns:
-        None where it does not converge to points in front of the cameras.
+        The state; None where it does not converge to points in front of the cameras.
     """
     sigma = _prior(config, mount)
     z = np.zeros(_NOISE + 9 * len(steps))
@@ -163,7 +163,7 @@ def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], s
 
 def _descend(s: _Unknowns, linearise: Callable[[_Unknowns], _Linear | None], sigma: np.ndarray,
              used: np.ndarray) -> tuple[_Unknowns, _Linear] | None:
-    """Levenberg and Marquardt, from where the closed form ends; None where it does not end."""
+    """Minimise by Levenberg-Marquardt from the unknowns `s`; return None where it does not converge."""
     here, damping = linearise(s), 1e-4
     if here is None:
         return None
@@ -183,7 +183,7 @@ def _descend(s: _Unknowns, linearise: Callable[[_Unknowns], _Linear | None], sig
 
 
 def _prior(config: VioConfig, mount: CameraMount) -> np.ndarray:
-    """1 sigma of biases and calibration before, shape (17,)."""
+    """Return the prior 1 sigma of biases and calibration, shape (17,)."""
     c, imu = config.calibration, config.imu
     return np.concatenate([
         np.repeat([imu.gyro_bias_init, imu.accel_bias_init, c.rotation, c.translation], 3),
@@ -191,7 +191,7 @@ def _prior(config: VioConfig, mount: CameraMount) -> np.ndarray:
 
 
 def _integrate(s: _Unknowns, steps: Sequence[np.ndarray], sigma: np.ndarray) -> _Motion:
-    """Motion from the first frame on, and how it follows from the unknowns."""
+    """Integrate the motion from the first frame on, with its derivatives with respect to the unknowns."""
     n, k = len(steps) + 1, len(s.z)
     R, p, v, w = np.empty((n, 3, 3)), np.zeros((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
     D = np.zeros((n, 9, k))  # of theta, p, v
@@ -221,13 +221,13 @@ def _integrate(s: _Unknowns, steps: Sequence[np.ndarray], sigma: np.ndarray) -> 
 
 
 def _level(R_WB: np.ndarray) -> np.ndarray:
-    """Two rotation vectors in B across up: turns that gravity sees, shape (3, 2)."""
+    """Return two rotation vectors in B orthogonal to up, i.e. the turns that gravity makes observable, shape (3, 2)."""
     return R_WB.T[:, :2]
 
 
 def _linearised(s: _Unknowns, steps: Sequence[np.ndarray], sights: Sequence[Sight], used: np.ndarray, sliding: Sliding, variance: float,
                 sigma: np.ndarray) -> _Linear | None:
-    """The normal equations at some unknowns; None where a point is not in front of a camera."""
+    """Return the normal equations at given unknowns; None where a point is not in front of a camera."""
     motion = _integrate(s, steps, sigma)
     chosen = [x for x, ok in zip(sights, used) if ok]
     f = np.concatenate([x.frames for x in chosen])
@@ -267,7 +267,7 @@ def _linearised(s: _Unknowns, steps: Sequence[np.ndarray], sights: Sequence[Sigh
 
 
 def _moved(s: _Unknowns, step: np.ndarray, sigma: np.ndarray, points: list, used: np.ndarray) -> _Unknowns:
-    """The unknowns after a step, and the points with them."""
+    """Return the unknowns, points included, after a step."""
     X_W, z = s.X_W.copy(), s.z.copy()
     for j, (R_f, H_1, r_1) in zip(np.flatnonzero(used), points):
         X_W[j] += np.linalg.solve(R_f, r_1 - H_1 @ step)
@@ -278,7 +278,7 @@ def _moved(s: _Unknowns, step: np.ndarray, sigma: np.ndarray, points: list, used
 
 
 def _at_the_end(s: _Unknowns, here: _Linear, used: np.ndarray, sigma: np.ndarray, misfit: float, cost: float) -> Refined:
-    """State and covariance at the last frame."""
+    """Return state and covariance at the last frame."""
     motion = here.motion
     R, v, D = motion.R_WB[-1], motion.v_WB[-1], motion.D[-1]
     v_B, up_B = R.T @ v, R[2]

@@ -1,10 +1,11 @@
 """The state of the MSCKF: inertial state, calibration, a sliding window of poses, landmarks, and their covariance.
 
 Error vector: theta, p, v, b_g, b_a (15) | camera rotation, camera position, time offset (7), lens (log fx, log fy,
-cx / fx, cy / fy) | clones (theta, p) | landmarks (X). Attitude errors are right perturbations, R_WB = R exp(theta), R_BC = R exp(theta_c).
+cx / fx, cy / fy) | clones (theta, p) | landmarks (X). Attitude errors are right perturbations, R_WB = R exp(theta),
+R_BC = R exp(theta_c).
 
-Jacobians are taken at the newest poses, and the covariance goes along when an update moves these (`State.inject`), so that yaw and
-position in W stay unobservable for the filter, as they are (docs/estimation.md).
+Jacobians are evaluated at the newest poses, and the covariance is transformed when an update moves these (`State.inject`), so
+that yaw and position in W remain unobservable for the filter, as they are in fact (docs/estimation.md).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _CAMERA = np.r_[THETA, POSITION, CAMERA_ROTATION, CAMERA_POSITION]  # what a poi
 
 @compiled
 def _gone_along(P, direction, scale):
-    """M P M^T, M = I + direction scale^T, both of shape (n,)."""
+    """Return M P M^T with M = I + direction scale^T, both vectors of shape (n,)."""
     n = len(P)
     q = P @ scale
     variance = scale @ q
@@ -50,7 +51,7 @@ class Clone:
 
 @dataclass
 class Landmark:
-    """A point in the state: position in W (3,), refused observations in a row."""
+    """A point in the state: position in W (3,), number of consecutive refusals."""
 
     X_W: np.ndarray
     strikes: int = 0
@@ -58,7 +59,7 @@ class Landmark:
 
 @dataclass
 class State:
-    """Owned by one `Msckf`; every change goes through it. `w_WB_B` is the newest angular velocity, bias removed [rad/s], shape (3,)."""
+    """State of one `Msckf`, which owns it. `w_WB_B` is the newest angular velocity, bias removed [rad/s], shape (3,)."""
 
     stamp: int
     R_WB: np.ndarray
@@ -89,19 +90,19 @@ class State:
         return CORE_SIZE + CLONE_SIZE * j
 
     def inject(self, dx: np.ndarray) -> None:
-        """Add an error estimate, shape (size,), to the state, and carry the covariance along.
+        """Add an error estimate, shape (size,), to the state, and transform the covariance.
 
-        An update leaves the errors as they are seen from W, R theta and dp + p x (R theta): in them a turn of everything about the
+        An update leaves the errors unchanged as seen from W, R theta and dp + p x (R theta): there, a common rotation about the
         vertical is the same whatever the estimate. So with a step s from p to p', and from R to R',
 
             theta := R'^T R theta,   dp := dp - s x (R theta),
 
-        likewise v with the present theta, each clone with its own. Otherwise what nothing can see would be another direction after each
-        step, and the filter would learn of it by its own corrections. A point's error is left in place as the camera sees it, in direction
-        and log distance (`camera_frame`), and so is its place in the camera by the step: the camera's rotation on the body and a distance
-        are hardly seen either.
+        likewise v with the present theta, each clone with its own. Otherwise the unobservable direction would change with each
+        step, and the filter would gain information on it from its own corrections. A point's error is kept constant as seen from
+        the camera, in direction and log distance (`camera_frame`), and the step moves the point in these coordinates: the
+        camera's rotation on the body and a distance are hardly observable either.
 
-        The direction of a scale (`scale_error`) moves with the estimate as well, and is carried along.
+        The direction of a change of scale (`scale_direction`) depends on the estimate as well, and is transformed with it.
         """
         direction = self.scale_direction()
         carry = self._move(dx)
@@ -113,7 +114,7 @@ class State:
             self.P = _gone_along(self.P, self.scale_direction() - carried, scale / (scale @ carried))
 
     def _move(self, dx: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Move all estimates; returns what carries errors along, rows (size, n) to rows."""
+        """Move all estimates; return the function that transforms errors accordingly, rows (size, n) to rows."""
         start, marks = self.landmark_start, list(self.landmarks.values())
         where = np.array([0, *map(self.clone_at, range(len(self.clones)))])[:, None] + np.arange(CLONE_SIZE)
         R, steps = np.array([self.R_WB, *(c.R_WB for c in self.clones)]), dx[where]
@@ -154,11 +155,11 @@ class State:
         return camera_frame.see(self.R_WB, self.p_WB, self.R_BC, self.p_BC, X_W)
 
     def scale_error(self) -> np.ndarray | None:
-        """What all lengths are relatively too short by, s = scale^T dx: the mean over the landmarks of d ln |X_C|.
+        """Return the gradient of s = scale^T dx, the relative deficit of all lengths: the mean over the landmarks of d ln |X_C|.
 
-        A camera alone does not see a scale of its own path c = p + R p_BC and of the points, N_s = (.. c_k, v + R (w x p_BC), X ..),
-        scale^T N_s = 1 but for the origin. A scale of the body's path it sees as soon as it is not in the body's centre, by p_BC / |X_C|.
-        It is blind to position and yaw.
+        A camera alone does not observe a common scale of its own path c = p + R p_BC and of the points,
+        N_s = (.. c_k, v + R (w x p_BC), X ..), scale^T N_s = 1 except for the origin. It does observe a scale of the body's
+        path, by p_BC / |X_C|, unless it is at the body's centre. s does not depend on position and yaw.
 
         Returns:
             Shape (size,); None with fewer than three landmarks.
@@ -173,7 +174,7 @@ class State:
         return out
 
     def scale_direction(self) -> np.ndarray:
-        """What a scale of the camera's path and of the points does to the state (`scale_error`), shape (size,)."""
+        """Return the change of the state per scale of the camera's path and of the points (`scale_error`), shape (size,)."""
         out = np.zeros(self.size)
         out[POSITION] = self.p_WB + self.R_WB @ self.p_BC
         out[VELOCITY] = self.v_WB + self.R_WB @ np.cross(self.w_WB_B, self.p_BC)
@@ -184,12 +185,12 @@ class State:
         return out
 
     def add_landmark(self, number: int, X_W: np.ndarray, step: np.ndarray, cross: np.ndarray, own: np.ndarray) -> None:
-        """Take a point into the state.
+        """Add a point to the state.
 
         Args:
             number: of its feature.
-            X_W: where it was linearised, shape (3,).
-            step: from there to its estimate, shape (3,).
+            X_W: linearisation point, shape (3,).
+            step: from there to the estimate, shape (3,).
             cross: covariance of its error with the state's, shape (3, size).
             own: its covariance, shape (3, 3).
         """
@@ -206,11 +207,11 @@ class State:
     def add_clone(self, frame: int) -> None:
         """Copy the present pose into the window.
 
-        The pose belongs to stamp + time_offset: an error of the offset moves it along the motion, so that tracks tell
-        the offset.
+        The pose belongs to stamp + time_offset: an error of the offset moves it along the motion, which makes the offset
+        observable.
 
         Args:
-            frame: its number.
+            frame: number of the frame.
         """
         n, at = self.size, self.landmark_start
         J = np.zeros((CLONE_SIZE, n))
@@ -226,7 +227,7 @@ class State:
         self.clones.append(Clone(frame, self.R_WB.copy(), self.p_WB.copy()))
 
     def drop_clones(self, which: list[int]) -> None:
-        """Marginalise clones: their rows leave the covariance."""
+        """Marginalise clones: remove their rows and columns from the covariance."""
         gone = set(which)
         if gone:
             rows = np.concatenate([np.arange(self.clone_at(j), self.clone_at(j) + 6) for j in gone])

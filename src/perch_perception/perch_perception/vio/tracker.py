@@ -1,11 +1,11 @@
-"""KLT tracks: pyramidal Lucas-Kanade from frame to frame, predicted by the gyro, checked there and back.
+"""KLT tracks: pyramidal Lucas-Kanade from frame to frame, predicted by the gyro, with a forward-backward check.
 
-Following a patch from frame to frame adds up its errors: in a hover the map turned by 0.1 deg/s. So a *reference* frame is kept
-while the view changes little, and each feature is found again by the patch it had there.
+Tracking a patch from frame to frame accumulates errors: in a hover the map turned by 0.1 deg/s. A *reference* frame is therefore
+kept while the view changes little, and each feature is located again by its patch in that frame.
 
-What stays where it is in the image while the scene moves, the lens's vignetting above all, pulls every track towards standing
-still: over a floor of low contrast by pixels, all of them the same way. Patches are therefore compared without their
-surroundings' brightness (`flattened`).
+Brightness that is fixed in the image while the scene moves, above all the lens's vignetting, biases every track towards
+standstill: by pixels over a floor of low contrast, all in the same direction. Patches are therefore compared after the local mean
+brightness is subtracted (`flattened`).
 
 Outliers are found with the known rotation: two tracks then give the direction of translation, and RANSAC over pairs needs
 only a few draws.
@@ -52,7 +52,7 @@ _FLAT_STEP, _MID_GREY = 8, 128.0  # the average is taken in an image of 1 / step
 
 
 def _noise(image: np.ndarray) -> float:
-    """1 sigma of an image's white noise [grey levels], from second differences along and across some rows (Immerkaer 1996)."""
+    """Return 1 sigma of an image's white noise [grey levels], from second differences in some rows (Immerkaer 1996)."""
     above, row, below = (image[k : image.shape[0] - 2 + k : 16].astype(np.int16) for k in range(3))
     across = above - 2 * row + below
     second = across[:, :-2] - 2 * across[:, 1:-1] + across[:, 2:]
@@ -60,7 +60,7 @@ def _noise(image: np.ndarray) -> float:
 
 
 def flattened(image: np.ndarray) -> np.ndarray:
-    """An image less the average brightness of the surroundings, about mid-grey; uint8 (height, width)."""
+    """Return an image minus its local mean brightness, around mid-grey; uint8 (height, width)."""
     small = cv2.resize(image, None, fx=1 / _FLAT_STEP, fy=1 / _FLAT_STEP, interpolation=cv2.INTER_AREA)
     surroundings = cv2.resize(cv2.GaussianBlur(small, (0, 0), _FLATTEN / _FLAT_STEP), image.shape[::-1])
     return cv2.addWeighted(image, 1.0, surroundings, -1.0, _MID_GREY)
@@ -74,7 +74,7 @@ class Features:
         ids: numbers, shape (n,); the last `new` of them are new in this frame.
         pixels: shape (n, 2).
         new: how many are new.
-        sigma: of each patch's fit by the image's noise [px], shape (n,).
+        sigma: 1 sigma of each patch's fit by the image's noise [px], shape (n,).
     """
 
     ids: np.ndarray
@@ -84,7 +84,7 @@ class Features:
 
 
 class Tracker:
-    """Owns the previous frame, the reference frame, and the features in them."""
+    """KLT tracker: owns the previous frame, the reference frame, and the features in them."""
 
     def __init__(self, config: TrackerConfig, camera: Camera) -> None:
         self.config, self.camera = config, camera
@@ -102,17 +102,17 @@ class Tracker:
         self._view = mask
 
     def reset(self) -> None:
-        """Forget the previous frame; numbers are not used again."""
+        """Discard all frames and features; feature numbers are not reused."""
         self._previous, self._pixels, self._ids = None, np.zeros((0, 2), np.float32), np.zeros(0, int)
         self._reference, self._origins = None, {}
 
     def track(self, image: np.ndarray, R_now_before: np.ndarray, slack: float = 0.0) -> Features:
-        """Follow the features into a new frame and refill them.
+        """Track the features into a new frame, and detect new ones where too few are left.
 
         Args:
             image: grey, uint8 (height, width).
-            R_now_before: rotation of the camera since the frame before, takes rays of then into C of now, (3, 3).
-            slack: what it may be wrong by [rad].
+            R_now_before: rotation of the camera from C of the previous frame into C of the new one, shape (3, 3).
+            slack: bound of its error [rad].
         """
         image = flattened(image)
         if self._previous is not None and len(self._pixels):
@@ -144,7 +144,7 @@ class Tracker:
 
     def _search(self, source: np.ndarray, image: np.ndarray, pixels: np.ndarray, guess: np.ndarray,
                 levels: int, stop: tuple[int, int, float] = _STOP) -> tuple[np.ndarray, np.ndarray]:
-        """Where the patches of a source image at pixels (n, 2) lie in an image, from a guess (n, 2); which were found (n,)."""
+        """Locate the patches of a source image at pixels (n, 2) in an image, from a guess (n, 2); return pixels and success."""
         if not len(pixels):
             return np.zeros((0, 2), np.float32), np.zeros(0, bool)
         found_at, found, _ = cv2.calcOpticalFlowPyrLK(
@@ -153,7 +153,7 @@ class Tracker:
         return found_at.reshape(-1, 2), found.ravel() > 0
 
     def _return_to_reference(self, image: np.ndarray) -> None:
-        """Place features where the patch of the reference frame fits best, if that is close to where they were followed to."""
+        """Move features to the best fit of their patch in the reference frame, where that is close to the tracked pixel."""
         index = np.flatnonzero([i in self._origins for i in self._ids.tolist()])
         if self._reference is None or not len(index):
             return
@@ -163,10 +163,11 @@ class Tracker:
         self._pixels[index[near]] = placed[near]
 
     def _thin(self) -> None:
-        """Let go features that have come close to an older one.
+        """Drop features that have come close to an older one.
 
-        As the vehicle rises, those from the ground draw together under it: at 4 m all of them lay in a spot 15 deg wide, which
-        knows height and heading hardly and is out of view at the first fast turn. What goes makes room for others elsewhere.
+        As the vehicle climbs, ground features from the start converge under it: at 4 m all of them lay within 15 deg, which
+        hardly determines height and heading and leaves the view at the first fast turn. Dropping some makes room for features
+        elsewhere.
         """
         least = _CROWDING * _SPACING
         if len(self._pixels) < 2:
@@ -189,7 +190,10 @@ class Tracker:
         self._origins = dict(zip(self._ids.tolist(), self._pixels.copy()))
 
     def _one_translation(self, rays: np.ndarray, after: np.ndarray, good: np.ndarray, slack: float) -> np.ndarray:
-        """Tracks that agree with the translation most of them share, (n,) bool; rays are those before, turned up to `slack` [rad]."""
+        """Return the tracks that agree with the translation shared by most of them, (n,) bool.
+
+        `rays` are those of the previous frame, rotated into the new one with an error of up to `slack` [rad].
+        """
         index = np.flatnonzero(good)
         if len(index) < 8:
             return good
@@ -207,11 +211,11 @@ class Tracker:
         return out
 
     def _fit_sigma(self, image: np.ndarray, noise: float) -> np.ndarray:
-        """1 sigma of the least squares fit of each feature's patch, along the axis in which it is known worst [px], shape (n,).
+        """Return 1 sigma of the least squares fit of each feature's patch, along its least certain axis [px], shape (n,).
 
         sigma^2 = sigma_n^2 / lambda_min(sum g g^T), with sigma_n the image's noise [grey levels] and g the gradients over the
-        patch [grey levels/px] (Foerstner and Guelch 1987), less what the noise itself adds to g g^T. Where noise is all that is
-        in the image the scatter of that bounds sigma.
+        patch [grey levels/px] (Foerstner and Guelch 1987), less the contribution of the noise itself to g g^T. Where the image
+        contains only noise, the scatter of that contribution bounds sigma.
         """
         if not len(self._pixels):
             return np.zeros(0)
@@ -224,9 +228,9 @@ class Tracker:
         return noise / np.sqrt(_WINDOW**2 * np.maximum(of_scene, _NOISE_SCATTER * of_noise))
 
     def _refill(self, image: np.ndarray, noise: float) -> int:
-        """Detect corners away from the features there are; those that noise alone would make are not taken.
+        """Detect corners away from existing features, except those that noise alone would produce; return their number.
 
-        At half the resolution: the smoothing leaves nothing that needs more, and it costs a quarter.
+        Detection runs at half the resolution: the smoothing leaves no finer detail, and the cost is a quarter.
         """
         mask = self._view[::2, ::2].copy()
         for x, y in self._pixels:

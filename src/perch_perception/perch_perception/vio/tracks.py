@@ -1,4 +1,4 @@
-"""Feature tracks as the filter needs them: bearings by frame, for as long as the window remembers the frame."""
+"""Feature tracks for the filter: bearings by frame, for as long as the frame is in the window."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Track:
 
 @dataclass
 class Tracks:
-    """All features that are seen now, by number."""
+    """Tracks of all features in the newest frame, by feature number."""
 
     by_id: dict[int, Track] = field(default_factory=dict)
 

@@ -1,4 +1,4 @@
-"""A point from its bearings in several poses: linear solution, then Gauss-Newton on the bearings' residuals."""
+"""Triangulation of a point from its bearings in several poses: linear solution, then Gauss-Newton on the bearings' residuals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _solve3(A, y, x):
 
 @compiled
 def _triangulate(centres, rays, cos_parallax, limit, X):
-    """Point from camera centres (m, 3) and unit rays in W (m, 3); False where there is none worth using."""
+    """Triangulate a point into `X` from camera centres (m, 3) and unit rays in W (m, 3); False where it is not usable."""
     m = centres.shape[0]
     least = 1.0
     for i in range(m):
@@ -88,13 +88,13 @@ def _triangulate(centres, rays, cos_parallax, limit, X):
 
 
 def triangulate(centres_W: np.ndarray, rays_W: np.ndarray, least_parallax: float, noise: float) -> np.ndarray | None:
-    """Position of a point seen from several camera poses.
+    """Return the position of a point seen from several camera poses.
 
     Args:
         centres_W: camera centres [m], shape (m, 3).
         rays_W: unit bearings turned into W, shape (m, 3).
-        least_parallax: largest angle between two rays must exceed it [rad].
-        noise: 1 sigma of a bearing [rad]; a mean residual above 4 sigma refuses the point.
+        least_parallax: the largest angle between two rays must exceed this [rad].
+        noise: 1 sigma of a bearing [rad]; a point with an RMS residual above 4 sigma is refused.
 
     Returns:
         X_W, shape (3,), or None without parallax, behind a camera, or with residuals too large.

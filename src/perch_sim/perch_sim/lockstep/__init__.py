@@ -1,7 +1,7 @@
-"""The order of a simulated flight, without ROS: who works when, and from which step on its results count.
+"""Order of a simulated flight, without ROS: when each participant works, and from which step on its results take effect.
 
 `Schedule` moves packets between the vehicle and its participants; `LocalParticipant` is a component in this process. Over ROS
-a participant is another process, of which the schedule only sees what it takes and what it gives.
+a participant may be in another process, with which the schedule exchanges only inputs and outputs.
 """
 
 from perch_sim.lockstep.batches import Arrival

@@ -1,4 +1,4 @@
-"""What a slow participant works on: batches of packets, begun when their images are drawn, and its place in the order of a flight."""
+"""Batches of packets for slow participants, begun when their images are rendered, and places in the order of a flight."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class Arrival(NamedTuple):
     """A camera frame that has arrived.
 
     Attributes:
-        camera: its name.
-        stamp: as in its header [ns].
-        middle: of the exposure, on the IMU's clock [ns].
-        image: as emitted; None: the camera takes no images, or this one is lost.
+        camera: name of the camera.
+        stamp: stamp of the frame's header [ns].
+        middle: middle of the exposure, on the IMU's clock [ns].
+        image: image as emitted; None: the camera takes no images, or this one is lost.
     """
 
     camera: str
@@ -29,7 +29,7 @@ class Arrival(NamedTuple):
 
 
 class Batch:
-    """Work of a slow participant."""
+    """Batch of packets for a slow participant, with its results."""
 
     __slots__ = ("stamp", "due", "packets", "begun", "results")
 
@@ -40,12 +40,12 @@ class Batch:
 
 
 class Place:
-    """A participant's place in the order, taken or empty.
+    """Place of a participant in the order, occupied or empty.
 
     Attributes:
-        inbox: what has come since the last batch.
-        coming: slow: batches without results yet, oldest first; one at a time is worked on.
-        done: slow: batches whose results do not count yet.
+        inbox: packets received since the last batch.
+        coming: batches of a slow participant without results, oldest first; one at a time is processed.
+        done: batches of a slow participant whose results are not due yet.
         last: step of the last batch.
     """
 
@@ -60,16 +60,16 @@ class Place:
 
     @property
     def inputs(self) -> frozenset[str]:
-        """Channels that its participant takes."""
+        """Input channels of its participant."""
         return frozenset() if self.participant is None else self.participant.inputs
 
     @property
     def takes_images(self) -> bool:
-        """Whether images are among what its participant takes."""
+        """Whether its participant has images among its inputs."""
         return any(channel.endswith("/image_raw") for channel in self.inputs)
 
     def awaits(self, arrival: Arrival) -> bool:
-        """Whether a frame starts work: with its image for those who take images."""
+        """Return whether a frame triggers work; a participant that takes images requires the image."""
         if f"camera_{arrival.camera}/image_raw" in self.inputs:
             return arrival.image is not None
         return f"camera_{arrival.camera}/camera_info" in self.inputs
@@ -80,16 +80,16 @@ def _is_image(packet: Packet) -> bool:
 
 
 def is_drawn(image: CameraImage, timeout: float = 0.0) -> bool:
-    """Whether an image is there, or is within a time [s]."""
+    """Return whether an image has been rendered; wait for it up to a time [s]."""
     return image.ready is None or image.ready(timeout)
 
 
 def first_undrawn(batch: Batch) -> Packet | None:
-    """The first packet of a batch whose image is still being drawn."""
+    """Return the first packet of a batch whose image is still being rendered, or None."""
     return next((packet for packet in batch.packets
                  if _is_image(packet) and not is_drawn(packet.value)), None)
 
 
 def is_lost(packet: Packet) -> bool:
-    """Whether it is an image that will never come. One that is drawn when it is looked at always comes."""
+    """Return whether a packet is an image that was lost; images that are rendered on demand never are."""
     return _is_image(packet) and packet.value.ready is not None and packet.value.pixels() is None

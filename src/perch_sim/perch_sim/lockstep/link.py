@@ -1,7 +1,7 @@
-"""Batches and results between the vehicle's process and a participant's, over a local socket. No ROS.
+"""Transport of batches and results between the vehicle's process and a participant's, over a local socket; without ROS.
 
-A step goes back and forth four times. Over DDS each way takes 150 us and more; over a Unix socket 20 to 40, and the end of a process is
-the end of its connection, at once. Only processes of the same user are let in.
+A step takes four transfers in sequence. Over DDS each takes 150 us and more; over a Unix socket 20 to 40 us, and the end of a
+process ends its connection at once. Only processes of the same user are accepted.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _LENGTH = struct.Struct("!i")                                 # of a message, as
 
 
 def address(domain: str, namespace: str) -> str:
-    """Where the vehicle of a ROS domain and namespace listens: a name in Linux's abstract namespace, which leaves no file."""
+    """Return the address of the vehicle of a ROS domain and namespace, in Linux's abstract namespace, which leaves no file."""
     return f"\0perch-lockstep-{os.getuid()}-{domain}-{namespace.strip('/')}"
 
 
 def pack(stamp: int, packets: Sequence[Packet]) -> bytes:
-    """A batch or its results on the wire."""
+    """Return a batch, or its results, as bytes."""
     parts = [_BATCH.pack(stamp, len(packets))]
     for packet in packets:
         channel, data = packet.channel.encode(), packet.data
@@ -41,10 +41,10 @@ def pack(stamp: int, packets: Sequence[Packet]) -> bytes:
 
 
 def unpack(data: bytes, codec: Codec) -> tuple[int, list[Packet]]:
-    """Stamp [ns] and packets of what `pack` made.
+    """Return stamp [ns] and packets from bytes that `pack` made.
 
     Raises:
-        PerchError: it did not.
+        PerchError: the bytes are not a valid batch.
     """
     try:
         (stamp, count), offset = _BATCH.unpack_from(data), _BATCH.size
@@ -63,12 +63,12 @@ def unpack(data: bytes, codec: Codec) -> tuple[int, list[Packet]]:
 
 
 class Door:
-    """The vehicle's end: lets participants in."""
+    """The vehicle's listening socket, which accepts participants."""
 
     def __init__(self, where: str) -> None:
         """
         Raises:
-            PerchError: another vehicle listens there.
+            PerchError: another vehicle listens at this address, or listening fails.
         """
         try:
             self._listener = Listener(where, "AF_UNIX", backlog=16)
@@ -80,7 +80,7 @@ class Door:
         self._socket.setblocking(False)
 
     def let_in(self) -> list[tuple[str, frozenset[str], Connection]]:
-        """Who has come since the last call: name, the channels that it takes, and its connection."""
+        """Return the participants that have connected since the last call: name, input channels and connection."""
         found: list[tuple[str, frozenset[str], Connection]] = []
         while True:
             try:
@@ -99,43 +99,43 @@ class Door:
                 connection.close()
 
     def close(self) -> None:
-        """Let nobody in any more."""
+        """Stop accepting participants."""
         self._listener.close()
 
 
 class Sending:
-    """Sends messages to a connection without ever waiting for a process that hangs: it reads the rest when it goes on."""
+    """Sends messages over a connection without waiting for a process that hangs; the rest is sent when it reads again."""
 
     def __init__(self, connection: Connection) -> None:
         self._socket = socket.socket(fileno=os.dup(connection.fileno()))
         self._rest = memoryview(b"")
 
     def send(self, data: bytes) -> None:
-        """Send a message; the one before it has been read.
+        """Send a message, with at most `_SEND_LIMIT` of waiting for the reader; the previous one must have been read.
 
         Raises:
-            OSError: the other end is gone.
+            OSError: the other end has closed the connection.
         """
         self._rest = memoryview(_LENGTH.pack(len(data)) + data)
         self.go_on(0)
 
     def go_on(self, flags: int = socket.MSG_DONTWAIT) -> None:
-        """Send what is left, as far as that goes.
+        """Send as much of the rest as possible.
 
         Raises:
-            OSError: the other end is gone.
+            OSError: the other end has closed the connection.
         """
         with suppress(BlockingIOError):
             while self._rest:
                 self._rest = self._rest[self._socket.send(self._rest, flags):]
 
     def close(self) -> None:
-        """No more is sent."""
+        """Close the sending socket."""
         self._socket.close()
 
 
 def knock(where: str, name: str, inputs: frozenset[str]) -> Connection | None:
-    """A participant's connection to the vehicle; None: it is not there."""
+    """Connect a participant to the vehicle; return None if there is no vehicle."""
     with suppress(OSError):
         connection = Client(where, "AF_UNIX")
         connection.send_bytes(json.dumps({"node": name, "inputs": sorted(inputs)}).encode())
@@ -144,24 +144,24 @@ def knock(where: str, name: str, inputs: frozenset[str]) -> Connection | None:
 
 
 class Waiting:
-    """Waits for several connections. `Connection.poll` makes a selector for each call, which takes 0.1 ms."""
+    """Waits for data on several connections. `Connection.poll` creates a selector for each call, which takes 0.1 ms."""
 
     def __init__(self) -> None:
         self._poll = select.poll()
         self._connections: dict[int, Connection] = {}
 
     def add(self, connection: Connection) -> None:
-        """Wait for this one, too."""
+        """Add a connection."""
         self._connections[connection.fileno()] = connection
         self._poll.register(connection.fileno(), select.POLLIN)
 
     def remove(self, connection: Connection) -> None:
-        """Do not wait for it any more, and close it."""
+        """Remove a connection, and close it."""
         if not connection.closed:
             self._poll.unregister(connection.fileno())
             del self._connections[connection.fileno()]
             connection.close()
 
     def ready(self, timeout: float) -> list[Connection]:
-        """Those that can be read, or have ended; waits for the first of them up to `timeout` [s]."""
+        """Return the connections that can be read or have ended; wait for the first up to `timeout` [s]."""
         return [self._connections[number] for number, _ in self._poll.poll(1e3 * timeout)]

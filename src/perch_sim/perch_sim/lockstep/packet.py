@@ -1,4 +1,4 @@
-"""What crosses the schedule: a value on a channel, as a value or as the bytes of its message, each made when it is asked for."""
+"""Packets of the schedule: a value on a channel, as a value or as a serialised message, each created when it is first read."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from typing import Any, Protocol
 
 
 class Codec(Protocol):
-    """Values to serialised messages and back."""
+    """Converts values to serialised messages and back."""
 
     def encode(self, channel: str, value: Any) -> bytes:
-        """The message of a value."""
+        """Return the serialised message of a value."""
 
     def decode(self, channel: str, data: bytes) -> Any:
-        """The value of a message."""
+        """Return the value of a serialised message."""
 
 
 class Packet:
-    """One emission.
+    """One emitted value.
 
     Attributes:
         channel: relative name of the topic.
-        value: as components take it; decoded from `data` when it is first looked at.
-        data: serialised message; encoded from `value` when it is first looked at.
+        value: value for components; decoded from `data` when it is first read.
+        data: serialised message; encoded from `value` when it is first read.
     """
 
     __slots__ = ("channel", "value", "data", "_codec")
@@ -34,20 +34,20 @@ class Packet:
         """
         Args:
             channel: relative name of the topic.
-            value: as components take it.
-            codec: makes `data`; None: nobody asks for it.
+            value: value for components.
+            codec: encodes `data`; None: `data` is never read.
         """
         self.channel, self.value, self._codec = channel, value, codec
 
     @classmethod
     def received(cls, channel: str, data: bytes, codec: Codec | None = None) -> Packet:
-        """A packet of a serialised message."""
+        """Return the packet of a serialised message."""
         packet = cls.__new__(cls)
         packet.channel, packet.data, packet._codec = channel, data, codec
         return packet
 
     def __getattr__(self, name: str) -> Any:
-        """The form that is not there yet: a slot that is set is read without this call."""
+        """Create the missing form, value or data; attributes that are set are read without this call."""
         if name not in ("value", "data"):
             raise AttributeError(name)
         if self._codec is None:

@@ -1,4 +1,4 @@
-"""Who takes part in a flight: batches of packets in, packets out. `LocalParticipant` is a component in this process."""
+"""Participants of a flight: batches of packets in, packets out. `LocalParticipant` is a component in this process."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from perch_sim.lockstep.tasks import BEGUN
 
 
 class Participant(Protocol):
-    """One who takes part, wherever it works.
+    """Participant of a flight, in this process or another.
 
     Attributes:
-        name: as in the schedule's tasks.
-        inputs: channels that it takes.
+        name: name of its task in the schedule.
+        inputs: channels of its inputs.
     """
 
     name: str
     inputs: frozenset[str]
 
     def begin(self, now: int, batch: Sequence[Packet]) -> None:
-        """Work on a batch; the batch before it has been finished.
+        """Begin to work on a batch; the previous batch must be finished.
 
         Args:
             now: stamp of the step at which the batch was closed [ns].
@@ -34,27 +34,27 @@ class Participant(Protocol):
         """
 
     def results(self) -> list[Packet] | None:
-        """What the batch has led to, in the order of emission, once; None: it is still being worked on. Never waits."""
+        """Return the packets from the batch, in the order of emission, once; None while the work continues. Never blocks."""
 
     def listen(self, taken: Callable[[str], bool]) -> None:
-        """The channels that somebody takes have changed; what nobody takes need not be emitted."""
+        """Set the check whether a channel has a receiver; packets without one need not be emitted."""
 
 
 class Future(Protocol):
-    """An answer that may still have to come, such as `concurrent.futures.Future` or rclpy's."""
+    """An answer that may be pending, such as `concurrent.futures.Future` or rclpy's."""
 
     def done(self) -> bool:
-        """Whether it has come."""
+        """Return whether the answer has arrived."""
 
     def result(self) -> Any:
-        """The answer; raises what it failed with."""
+        """Return the answer; raises the exception of a failed request."""
 
 
 Ask = Callable[[str, Any], Future]  # (channel of the service, request)
 
 
 class Answer:
-    """An answer that comes once, by a call; those after the first count for nothing."""
+    """An answer that is set by a call; calls after the first are ignored."""
 
     def __init__(self) -> None:
         self._done, self._value = False, None
@@ -64,16 +64,16 @@ class Answer:
             self._done, self._value = True, value
 
     def done(self) -> bool:
-        """Whether it has come."""
+        """Return whether the answer has arrived."""
         return self._done
 
     def result(self) -> Any:
-        """The answer."""
+        """Return the answer."""
         return self._value
 
 
 class _Awaited(NamedTuple):
-    """An answer to a component's own request: `take` gets it in the first batch from `due` [ns] on."""
+    """Answer to a request of a component: it is passed to `take` in the first batch from `due` [ns] on."""
 
     due: int
     take: Callable[[Any], None]
@@ -81,7 +81,7 @@ class _Awaited(NamedTuple):
 
 
 class Emissions:
-    """Collects what a component emits as packets. Log lines and diagnostics are none: add receivers to these ports."""
+    """Collects the outputs of a component as packets, except log lines and diagnostics: add receivers to these ports."""
 
     def __init__(self, component: Component[Any], codec: Codec | None = None) -> None:
         self._packets: list[Packet] = []
@@ -97,23 +97,23 @@ class Emissions:
         return lambda value: append(Packet(channel, value, codec))
 
     def listen(self, taken: Callable[[str], bool]) -> None:
-        """Collect these channels and no others."""
+        """Collect the channels for which `taken` returns True, and no others."""
         for channel, receivers, receive in self._receivers:
             if (receive in receivers) != taken(channel):
                 receivers.append(receive) if taken(channel) else receivers.remove(receive)
 
     def take(self) -> list[Packet]:
-        """What has been emitted since the last call."""
+        """Return the packets emitted since the last call."""
         packets = self._packets.copy()
         self._packets.clear()
         return packets
 
 
 def handlers(component: Component[Any]) -> dict[str, Callable[[Any], None]]:
-    """What handles each channel that a component takes.
+    """Return the handler of each input channel of a component.
 
     Raises:
-        PerchError: two inputs have one channel.
+        PerchError: two inputs have the same channel.
     """
     found: dict[str, Callable[[Any], None]] = {}
     for port in ports(type(component), Input):
@@ -125,24 +125,24 @@ def handlers(component: Component[Any]) -> dict[str, Callable[[Any], None]]:
 
 
 class LocalParticipant(Participant):
-    """A component in this process: a batch is worked on as it begins.
+    """A component in this process, which processes a batch when it begins.
 
-    It is finished at once, unless an answer to a request of its own that counts by now has not come, or its first batch waits for
-    a goal.
+    The batch is finished at once, unless a due answer to one of the component's own requests is missing, or the first batch waits
+    for a goal.
     """
 
     def __init__(self, component: Component[Any], codec: Codec | None = None, ask: Ask | None = None, hold: str = "", *,
                  name: str = "") -> None:
         """
         Args:
-            component: works here alone; its jobs run at once.
-            codec: of its packets; None: they never leave this process.
-            ask: takes the component's requests to whoever serves them; None: nobody does.
-            hold: name of an action without whose first goal the flight does not begin; one that joins a flight under way does not wait.
-            name: as in the schedule's tasks; empty: the class's, in lower case with underscores.
+            component: component, which must have no other host; its jobs run at once.
+            codec: codec of its packets; None: they never leave this process.
+            ask: sends the component's requests to their servers; None: there are no servers.
+            hold: name of an action: the flight begins with its first goal, unless the participant joins a flight under way.
+            name: name of its task in the schedule; empty: that of the class, in lower case with underscores.
 
         Raises:
-            PerchError: two inputs have one channel, or `hold` is no action.
+            PerchError: two inputs have the same channel, or `hold` is not an action.
         """
         kind = type(component)
         self.component, self.name = component, name or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower()
@@ -165,14 +165,14 @@ class LocalParticipant(Participant):
     # -- batches -----------------------------------------------------------------------------------------------------
 
     def begin(self, now: int, batch: Sequence[Packet]) -> None:
-        """Work on a batch, or wait for what it needs."""
+        """Process a batch, or wait for the goal or the answers that it needs."""
         if now > BEGUN:
             self._hold = ""
         self._now, self._batch, self._begun = now, iter(batch), True
         self._go_on()
 
     def results(self) -> list[Packet] | None:
-        """The packets of the batch; None: it waits for an answer or its first goal."""
+        """Return the packets from the batch; None while it waits for an answer or its first goal."""
         if self._batch is not None:
             self._go_on()
             if self._batch is not None:
@@ -180,7 +180,7 @@ class LocalParticipant(Participant):
         return self._emissions.take()
 
     def listen(self, taken: Callable[[str], bool]) -> None:
-        """Emit on these channels alone."""
+        """Emit only on channels for which `taken` returns True."""
         self._emissions.listen(taken)
 
     def _go_on(self) -> None:
@@ -211,17 +211,17 @@ class LocalParticipant(Participant):
     # -- requests ----------------------------------------------------------------------------------------------------
 
     def request(self, port_name: str, request: Any, reply: Callable[[Any], None]) -> None:
-        """A request to a service of the component: in front of the next batch; at once as long as there has been none."""
+        """Pass a request to a service of the component, in front of the next batch; before the first batch, at once."""
         handler = self._port(Service, port_name).handler(self.component)
         self.enter(port_name, lambda: handler(request, reply))
 
     def goal(self, port_name: str, goal: Any, answered: Callable[[str], None] | None = None) -> None:
-        """A goal for an action of the component, as `request`.
+        """Pass a goal to an action of the component, as `request` does.
 
         Args:
-            port_name: of the action.
+            port_name: name of the action's port.
             goal: a `perch_core.component.Goal`.
-            answered: gets why it is rejected, or an empty string.
+            answered: called with the reason for a rejection, or an empty string.
         """
         handler = self._port(Action, port_name).handler(self.component)
 
@@ -233,7 +233,7 @@ class LocalParticipant(Participant):
         self.enter(port_name, hand_over)
 
     def enter(self, port_name: str, call: Callable[[], None]) -> None:
-        """Call what hands a request or a goal to the port, as `request`."""
+        """Schedule a call that passes a request or a goal to the port, as `request` does."""
         if port_name == self._hold:
             self._hold = ""
         if self._begun:
@@ -242,7 +242,7 @@ class LocalParticipant(Participant):
             call()
 
     def serves(self, channel: str) -> str | None:
-        """The name of the service with this channel; None: there is none."""
+        """Return the name of the service with this channel, or None."""
         return next((port.name for port in ports(type(self.component), Service) if port.channel(self.component) == channel), None)
 
     def _port(self, kind: type, name: str) -> Any:
@@ -261,7 +261,7 @@ class LocalParticipant(Participant):
 
 
 def local_servers(servers: Iterable[LocalParticipant]) -> Ask:
-    """Takes requests to components in this process."""
+    """Return a function that sends requests to components in this process."""
     known = list(servers)
 
     def ask(channel: str, request: Any) -> Future:

@@ -1,15 +1,15 @@
-"""The order of a simulated flight: who sees what at which step. Nothing here waits, and nothing here knows ROS or a clock.
+"""Order of a simulated flight: which component receives which packets at which step. Independent of ROS and of clocks.
 
 Per control period, at the stamp t at which it ends:
 
-1. The vehicle advances. Camera frames that have arrived start the work of those who take them.
-2. Results of slow participants that are due at t are released, sorted by channel, within a channel in the order of emission; then
-   comes what the vehicle emitted.
-3. Fast participants work, one after the other, each on what has come to it; what they emit goes on at once.
-4. Slow participants whose frame has arrived, or whose period is over, get all that has come to them as one batch.
+1. The vehicle advances.
+2. Results of slow participants that are due by t are delivered, sorted by channel, within a channel in order of emission; then
+   the packets of the vehicle are delivered.
+3. Fast participants work in sequence, each on the packets in its inbox; their outputs are delivered at once.
+4. Slow participants whose frame has arrived, or whose period is over, receive all packets in their inbox as one batch.
 
-Slow participants work while the flight goes on, but their results *count* only from trigger + latency, however long the work took:
-the step at which they are due waits for them. So a seed gives the same flight wherever and however fast the participants work.
+Slow participants work while the flight continues, but their results take effect only at trigger + latency, however long the work
+takes: the step at which they are due waits for them. A seed therefore gives the same flight on any machine, at any speed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _CHANNEL = attrgetter("channel")
 
 
 class Owed(NamedTuple):
-    """What the flight waits for: of whom, what, and for which stamp [ns]."""
+    """A missing input for which the flight waits: name of its source, description, and stamp [ns]."""
 
     name: str
     what: str
@@ -43,16 +43,16 @@ class Owed(NamedTuple):
 
 
 class Vehicle(Protocol):
-    """A component that owns the flight's time; its inputs are handled as they come."""
+    """Component that owns the time of the flight; its inputs are handled on delivery."""
 
     time: int  # stamp of the step that it has reached [ns]
 
     def advance(self) -> Sequence[Arrival]:
-        """One control period and what is emitted in it; the frames that have arrived."""
+        """Advance one control period, emit its outputs, and return the camera frames that have arrived."""
 
 
 class _Routes(dict):
-    """Channel -> what takes its packets; made when a channel is first used."""
+    """Channel -> receivers of its packets; found when a channel is first used."""
 
     def __init__(self, find: Callable[[str], list[Callable[[Packet], None]]]) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class _Routes(dict):
 
 
 class Schedule:
-    """One flight. Call `advance` whenever something may have come.
+    """Schedule of one flight. Call `advance` whenever something may have arrived.
 
     Attributes:
         now: stamp of the present step [ns].
@@ -75,10 +75,10 @@ class Schedule:
                  codec: Codec | None = None) -> None:
         """
         Args:
-            vehicle: owns time: a `Vehicle`.
-            participants: who takes part from the beginning.
-            tasks: of all who may take part, in the order in which they work within a step.
-            codec: of what the vehicle emits; None: it never leaves this process.
+            vehicle: component that owns the time, a `Vehicle`.
+            participants: participants from the beginning.
+            tasks: tasks of all possible participants, in the order in which they work within a step.
+            codec: codec of the vehicle's packets; None: they never leave this process.
 
         Raises:
             PerchError: a participant has no task.
@@ -102,13 +102,13 @@ class Schedule:
 
     @property
     def names(self) -> list[str]:
-        """Who takes part, in the order in which they work within a step."""
+        """Names of the participants, in the order in which they work within a step."""
         return [name for name, place in self._places.items() if place.participant is not None]
 
     def join(self, participant: Participant) -> None:
-        """Take a participant in, or in the place of one with its name, whose debts end.
+        """Add a participant, or replace the one of the same name, whose pending results are discarded.
 
-        It is given the latest packet of each latched channel; a fast one whose answer is awaited gets the present batch, too.
+        It receives the latest packet of each latched channel; a fast one whose answer is awaited receives the present batch, too.
 
         Raises:
             PerchError: there is no task for its name.
@@ -124,7 +124,7 @@ class Schedule:
         self._reroute()
 
     def drop(self, name: str) -> None:
-        """Go on without a participant, and without what it owes."""
+        """Remove a participant, and discard its pending results."""
         place = self._places[name]
         place.participant = None
         for queue in (place.inbox, place.coming, place.done):
@@ -163,10 +163,10 @@ class Schedule:
     # -- going on ----------------------------------------------------------------------------------------------------
 
     def advance(self) -> bool:
-        """Go on as far as one control period.
+        """Continue the flight, by at most one control period.
 
         Returns:
-            True: a control period has been completed. False: something is `owed`; call again when it may have come.
+            True: a control period has been completed. False: something is `owed`; call again when it may have arrived.
         """
         for place in self._slow:
             if place.coming:
@@ -174,7 +174,7 @@ class Schedule:
         return next(self._steps)
 
     def owed(self) -> list[Owed]:
-        """What the flight waits for, after `advance` has returned False."""
+        """Return what the flight waits for, after `advance` has returned False."""
         if self._awaited is not None:
             return [Owed(self._awaited.name, "its answer to the present step", self.now)]
         missing = [Owed(f"camera_{camera}", "an image", images[0].stamp)
@@ -188,7 +188,7 @@ class Schedule:
         return missing
 
     def await_image(self, timeout: float) -> bool:
-        """Wait for an image without which the flight cannot go on. False: it waits for none.
+        """Wait for an image without which the flight cannot continue; return False if there is none.
 
         Args:
             timeout: longest wait [s].
@@ -206,7 +206,7 @@ class Schedule:
         return False
 
     def _flight(self) -> Iterator[bool]:
-        """Control period after control period; yields True after each, and False where it has to wait."""
+        """Run the flight; yield True after each control period, and False where it has to wait."""
         routes, vehicle, emissions = self._routes, self._vehicle, self._emissions
         while True:
             arrivals = vehicle.advance()
@@ -260,7 +260,7 @@ class Schedule:
     # -- slow participants -------------------------------------------------------------------------------------------
 
     def _trigger(self, now: int, arrivals: Sequence[Arrival]) -> None:
-        """Close the batches of those whose work begins at this step."""
+        """Close the batches of slow participants whose work begins at this step."""
         for place in self._slow:
             if place.participant is None:
                 continue
@@ -280,7 +280,7 @@ class Schedule:
             self._work(place)
 
     def _work(self, place: Place) -> None:
-        """Take results and begin batches in their order, as far as that goes."""
+        """Collect results and begin batches in order, as far as possible."""
         coming, participant = place.coming, place.participant
         assert participant is not None  # an empty place has no batches
         while coming:
@@ -311,7 +311,7 @@ class Schedule:
                 self._undrawn.setdefault(arrival.camera, deque()).append(arrival.image)
 
     def _crowded(self) -> bool:
-        """Whether a camera's frames arrive faster than they are drawn: the flight waits even where nobody else does."""
+        """Return whether frames arrive faster than they are rendered: then the flight waits, even if no participant does."""
         crowded = False
         for images in self._undrawn.values():
             while images and is_drawn(images[0]):

@@ -1,4 +1,4 @@
-"""Who may take part in a flight, in which order, what starts their work, and how long it takes in simulation time."""
+"""Tasks of all possible participants of a flight: their order, what triggers them, and their latency in simulation time."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ RECORDING_TIME = 0.1  # [s]
 
 
 class Task(NamedTuple):
-    """When a participant works.
+    """Trigger and latency of a participant's work.
 
     Attributes:
-        latency: from the middle of an exposure or from a step to when the results count [s]; None: it works at every step, and its
-            results count at once.
-        period: steps from one batch to the next; 0: a batch with every frame of the cameras that it takes.
+        latency: time from the middle of an exposure, or from a step, to when the results take effect [s]; None: the participant
+            works at every step, and its results take effect at once.
+        period: steps from one batch to the next; 0: one batch per frame of its cameras.
     """
 
     latency: float | None = None
@@ -27,7 +27,7 @@ class Task(NamedTuple):
 
 
 def flight_tasks(latency: Latency) -> dict[str, Task]:
-    """Everybody's task by name, in the order in which they work within a step."""
+    """Return the tasks of all participants by name, in the order in which they work within a step."""
     return {
         "estimator": Task(),
         "controller": Task(),
@@ -41,6 +41,6 @@ def flight_tasks(latency: Latency) -> dict[str, Task]:
 
 
 def is_slow(name: str) -> bool:
-    """Whether the results of a participant count later than its step."""
+    """Return whether the results of a participant take effect later than at its step."""
     task = flight_tasks(Latency()).get(name)
     return task is not None and task.latency is not None

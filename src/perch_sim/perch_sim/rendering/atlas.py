@@ -1,4 +1,4 @@
-"""One image that holds every face's texture at every resolution, so that one `cv2.remap` draws a whole frame.
+"""One image with the textures of all faces at all resolutions, so that one `cv2.remap` renders cells of all faces.
 
 Levels are a factor sqrt(2) apart: half as much blur, or aliasing, as with the usual factor of two.
 """
@@ -22,14 +22,14 @@ VOID = 60  # grey level where no face is hit: a camera that left the room
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """Textures of all faces.
+    """Textures of all faces at all resolutions.
 
     Attributes:
         image: uint8, shape (rows, cols).
         affine: float32, shape (faces, levels, 4): (sx, ox, sy, oy) with column = sx u + ox and row = sy v + oy,
             u and v metres right and up from the face's centre.
         levels: number of levels of each face, shape (faces,).
-        void: column and row of the texel that stands for "nothing".
+        void: column and row of the texel for rays that hit no face.
     """
 
     image: np.ndarray
@@ -39,7 +39,7 @@ class Atlas:
 
 
 def _levels(texture: np.ndarray) -> list[np.ndarray]:
-    """The texture at scales 2^(-l/2), each even level by exact halving."""
+    """Return the texture at scales 2^(-l/2); from l = 2 on, each level is level l - 2, halved."""
     rows, cols = texture.shape
     out = [texture]
     while min(rows, cols) * 2 ** (-len(out) / LEVELS_PER_OCTAVE) >= 4:
@@ -51,7 +51,7 @@ def _levels(texture: np.ndarray) -> list[np.ndarray]:
 
 
 def face_texture(scene: Scene, number: int, face: Face) -> np.ndarray:
-    """Full-resolution texture of `scene.faces()[number]`, uint8: rows run along -up, columns along right."""
+    """Return the full-resolution texture of `scene.faces()[number]`, uint8: rows run along -up, columns along right."""
     rng = np.random.default_rng([scene.seed, number])
     if face.kind == "pad" and scene.board is not None:
         return textures.pad(scene.board, face.texel, rng)
@@ -61,7 +61,7 @@ def face_texture(scene: Scene, number: int, face: Face) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def build_atlas(scene: Scene) -> Atlas:
-    """Draw and pack the textures of a scene; both cameras of a vehicle share the result. Kept are those of two scenes, 50 MB each."""
+    """Draw and pack the textures of a scene; both cameras of a vehicle share the result. Two scenes are cached, 50 MB each."""
     faces = scene.faces()
     tiles = []
     for number, face in enumerate(faces):
@@ -86,7 +86,7 @@ def build_atlas(scene: Scene) -> Atlas:
 
 
 def _pack(shapes: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Places (x, y) of framed tiles on shelves, tallest first, and the shape of the whole."""
+    """Return the positions (x, y) of framed tiles on shelves, tallest first, and the shape of the atlas."""
     width = max(SHELF, max(cols for _, cols in shapes) + 2 * BORDER)
     places: list[tuple[int, int]] = [(0, 0)] * len(shapes)
     x = y = shelf = 0

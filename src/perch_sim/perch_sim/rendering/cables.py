@@ -1,9 +1,9 @@
-"""Cables in the image, by the distance between pixel rays and cable axes: no polygons, so that the width is right
+"""Rendering of cables by the distance between pixel rays and cable axes, not by polygons, so that the width is correct
 even where a wire is thinner than a pixel.
 
 For a straight piece with the point p and the unit direction l (camera at the origin), the ray r passes the axis at
-the signed distance s = r . (p x l) / |r x l|. The cylinder is where |s| < radius; what share of a pixel it covers
-follows from s and from how many pixels a metre across the wire spans there.
+the signed distance s = r . (p x l) / |r x l|. The ray meets the cylinder if |s| < radius; the share of a pixel that it
+covers follows from s and from the local scale across the wire [px/m].
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ LUMA = np.array([0.299, 0.587, 0.114])
 
 @dataclass(frozen=True, eq=False)
 class _Pieces:
-    """Straight pieces of one cable as seen from a camera: those that may be in the image.
+    """Straight pieces of one cable that may be in a camera's image.
 
     Attributes:
-        ends: their ends in the image [px], shape (n, 2, 2).
+        ends: ends of the pieces in the image [px], shape (n, 2, 2).
         start_C, direction: a point on each axis [m] and its unit direction, shape (n, 3).
         length: [m], shape (n,).
         moment: start x direction [m], shape (n, 3).
@@ -46,7 +46,7 @@ class _Pieces:
 
 
 class CablePainter:
-    """Paints cables over an image of the faces; holds nothing that changes."""
+    """Paints cables over an image of the faces; has no mutable state."""
 
     def __init__(self, cables: tuple[CableCurve, ...], camera: Camera) -> None:
         self.cables = tuple((_resample(cable.points_W), cable) for cable in cables)
@@ -62,7 +62,7 @@ class CablePainter:
             image: uint8, shape (height, width) or (height, width, 3), changed in place.
             p_WC, R_WC: pose of the camera in W [m].
             faces: matrices of the faces that may hide cables, shape (n, 3, 3): see `visibility`.
-            half: their half extents, shape (n, 2) [m].
+            half: half extents of these faces, shape (n, 2) [m].
         """
         order = sorted(self.cables, key=lambda item: -np.linalg.norm(item[0] - p_WC, axis=1).min())
         for points_W, cable in order:
@@ -94,7 +94,7 @@ class CablePainter:
                        np.cross(points_C[a], direction), scale[seen], a == 0, b == len(points_C) - 1)
 
     def _scale(self, points_C: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Pixels per metre across a wire, shape (n,): the image's area over its length along the wire."""
+        """Return the pixels per metre across a wire, shape (n,): area scale of the image over its length scale along the wire."""
         jacobian = self.camera.project_jacobian(points_C)
         across = np.cross(points_C, direction)
         across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
@@ -126,7 +126,7 @@ class CablePainter:
                     np.array(cable.colour, dtype=float))
 
     def _band(self, pieces: _Pieces, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Flat indices of the pixels around the pieces, and the piece that each belongs to."""
+        """Return the flat indices of the pixels around the pieces, and the piece to which each belongs."""
         ends = np.clip(np.rint(pieces.ends), -8000, 8000).astype(int)
         length = np.linalg.norm(pieces.ends[:, 1] - pieces.ends[:, 0], axis=1)
         bend = length**2 / (8 * self.camera.fx)  # what a fisheye makes of a straight piece
@@ -154,7 +154,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _resample(points_W: np.ndarray) -> np.ndarray:
-    """The polyline with points at most SPACING apart."""
+    """Return the polyline with points at most SPACING apart."""
     points_W = np.asarray(points_W, dtype=float)
     count = np.maximum(np.ceil(np.linalg.norm(np.diff(points_W, axis=0), axis=1) / SPACING).astype(int), 1)
     parts = [a + np.arange(n)[:, None] / n * (b - a) for a, b, n in zip(points_W[:-1], points_W[1:], count)]
@@ -162,7 +162,7 @@ def _resample(points_W: np.ndarray) -> np.ndarray:
 
 
 def _hidden(rays: np.ndarray, distance: np.ndarray, faces: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Whether a face is in front of the points at these distances along unit rays, shape (n,)."""
+    """Return whether a face is in front of the points at these distances along unit rays, shape (n,)."""
     hidden = np.zeros(len(rays), dtype=bool)
     for (half_u, half_v), M in zip(half, faces.astype(float)):
         inverse = rays @ M[2]
@@ -176,7 +176,7 @@ def _hidden(rays: np.ndarray, distance: np.ndarray, faces: np.ndarray, half: np.
 
 
 def _shade(offset: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Brightness across a round wire, at the share `offset` in [-1, 1] of its radius; flat where it is thin."""
+    """Return the brightness across a round wire, at the share `offset` in [-1, 1] of its radius; uniform for thin wires."""
     profile = 0.6 + 0.4 * np.sqrt(np.clip(1.0 - offset**2, 0.0, 1.0))
     thick = np.clip(width - 0.5, 0.0, 1.0)
     return thick * profile + (1.0 - thick) * (0.6 + 0.1 * np.pi)  # the profile's mean

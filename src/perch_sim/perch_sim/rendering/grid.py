@@ -1,9 +1,9 @@
-"""The image cut into cells of 8 x 8 pixels, with the camera's rays at their corners.
+"""Division of an image into cells of 8 x 8 pixels, with the camera's rays at their corners.
 
-Between the corners of a cell rays are interpolated bilinearly. A face's texture coordinates are ratios of two
-linear functions of the ray, so perspective is exact; what the lens bends over 8 px is left out: 0.01 px
-RMS, 0.06 px in the corners of the snapdragon vehicle's image. (A pinhole's rays are kept at z = 1, where
-interpolation is exact.)
+Between the corners of a cell, rays are interpolated bilinearly. A face's texture coordinates are ratios of two
+linear functions of the ray, so perspective is exact; the curvature of the lens's projection within 8 px is
+neglected: 0.01 px RMS, 0.06 px in the corners of the snapdragon vehicle's image. (Rays of a pinhole camera
+are scaled to z = 1, where interpolation is exact.)
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ CELL = 8  # [px]
 
 @lru_cache(maxsize=16)
 def sample_weights(supersampling: int) -> np.ndarray:
-    """Bilinear weights of a cell's corners (TL, TR, BL, BR) at its samples, float32, shape (4, 64 * ss^2).
+    """Return the bilinear weights of a cell's corners (TL, TR, BL, BR) at its samples, float32, shape (4, 64 * ss^2).
 
-    Samples run over pixels (row by row), and over the ss x ss samples inside each pixel.
+    The order of the samples is by pixels (row by row), then by the ss x ss samples inside each pixel.
     """
     ss = supersampling
     at = ((np.arange(CELL)[:, None] + (np.arange(ss) + 0.5) / ss) / CELL)  # (pixel, sample)
@@ -38,11 +38,11 @@ class CellGrid:
     Attributes:
         rows, cols: number of cells.
         nodes: rays in C at the corners (unit; z = 1 for a pinhole), float32, shape (3, (rows + 1) * (cols + 1));
-            zero where the lens sees nothing.
+            zero where the projection has no ray.
         corner_nodes: indices into `nodes` of each cell's TL, TR, BL, BR corner, shape (rows * cols, 4).
         corners: rays of the corners of each cell, float32, shape (rows * cols, 3, 4).
-        centres: unit rays through their centres, float32, shape (rows * cols, 3).
-        blind: cells that the lens does not fill, shape (rows * cols,).
+        centres: rays through the centres of the cells, float32, shape (rows * cols, 3).
+        blind: whether a corner of the cell is outside the lens's image, shape (rows * cols,).
         pixel_angle: angle that a pixel spans in each cell [rad], float32, shape (rows * cols,).
     """
 
@@ -56,13 +56,13 @@ class CellGrid:
     pixel_angle: np.ndarray
 
     def cells_in(self, region: Region) -> np.ndarray:
-        """Which cells a region of the image touches, shape (rows * cols,) bool."""
+        """Return which cells a region of the image touches, shape (rows * cols,) bool."""
         touched = np.zeros((self.rows, self.cols), dtype=bool)
         touched[tuple(slice(part.start // CELL, -(-part.stop // CELL)) for part in region)] = True
         return touched.ravel()
 
     def cell_of(self, pixels: np.ndarray) -> np.ndarray:
-        """Cells that hold pixels (n, 2), shape (n,); -1 outside the image and for NaN."""
+        """Return the cells that contain pixels (n, 2), shape (n,); -1 outside the image and for NaN."""
         with np.errstate(invalid="ignore"):
             col = np.floor((pixels[:, 0] + 0.5) / CELL)
             row = np.floor((pixels[:, 1] + 0.5) / CELL)
@@ -72,7 +72,7 @@ class CellGrid:
 
 @lru_cache(maxsize=8)
 def build_grid(camera: Camera) -> CellGrid:
-    """Cells of a camera's image; cameras with the same intrinsics share them."""
+    """Return the cells of a camera's image; cameras with the same intrinsics share them."""
     rows, cols = -(-camera.height // CELL), -(-camera.width // CELL)
     u, v = np.meshgrid(np.arange(cols + 1) * CELL - 0.5, np.arange(rows + 1) * CELL - 0.5)
     rays = camera.unproject(np.stack([u, v], axis=-1))

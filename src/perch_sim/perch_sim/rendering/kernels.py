@@ -1,8 +1,8 @@
 """The renderer's inner loops over cells and samples, compiled.
 
-In numpy each arithmetic operation is a pass over all samples of all cells; compiled, a sample is finished in registers, and
-without the interpreter lock, so that drawing threads (in process) do not hold each other up. The functions in numpy serve
-where numba does not, and tell in tests whether the kernels are right.
+In numpy each arithmetic operation is a pass over all samples of all cells; compiled, a sample is computed in registers, and
+without the interpreter lock, so that rendering threads of one process do not block each other. The numpy functions are used
+where numba is not available, and as reference for the kernels in tests.
 """
 
 from __future__ import annotations
@@ -147,18 +147,18 @@ def _nearer_samples(m: np.ndarray, half: np.ndarray, affine: np.ndarray, corners
 
 def classify_numpy(M: np.ndarray, half: np.ndarray, bounded: np.ndarray, nodes: np.ndarray, corner_nodes: np.ndarray,
                    first: np.ndarray, uniform: np.ndarray, shown: np.ndarray) -> None:
-    """Which face each cell shows.
+    """Determine the face that each cell shows.
 
     Args:
-        M: of the faces, see `View`, float32, shape (faces, 3, 3).
+        M: matrices of the faces, see `View`, float32, shape (faces, 3, 3).
         half: half extents, infinite where a face is not bounded, float32, shape (faces, 2) [m].
         bounded: row in `shown` of each face, -1 for those without edges, shape (faces,).
         nodes: rays at the corners of cells, float32, shape (3, n).
         corner_nodes: each cell's corners, shape (cells, 4).
         first: filled with the face at each cell's first corner, -1: none, shape (cells,).
         uniform: filled with whether the cell shows that face alone, shape (cells,) bool.
-        shown: holds the cells that an edge of each bounded face crosses; gets those added in which a corner's ray hits the
-            face, shape (bounded faces, cells) bool.
+        shown: initially the cells that an edge of each bounded face crosses; cells in which a corner's ray hits the face
+            are added, shape (bounded faces, cells) bool.
     """
     q = (M.reshape(-1, 3) @ nodes).reshape(len(M), 3, nodes.shape[1])
     inverse = q[:, 2]
@@ -175,16 +175,16 @@ def classify_numpy(M: np.ndarray, half: np.ndarray, bounded: np.ndarray, nodes: 
 def affine_of_cells_numpy(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, centres: np.ndarray, pixel_angle: np.ndarray,
                           table: np.ndarray, levels: np.ndarray, cells: np.ndarray, face: np.ndarray, supersampling: int,
                           levels_per_octave: int, out: np.ndarray) -> None:
-    """The atlas level that fits each cell: its texels are as large as a sample's footprint on the face.
+    """Select the atlas level for each cell whose texels are about as large as a sample's footprint on the face.
 
     Args:
-        M, distance: of the faces, see `View`.
+        M, distance: matrices and distances of the faces, see `View`.
         texel: size of the faces' texels at level 0 [m], shape (faces,).
         centres, pixel_angle: of the grid's cells, see `CellGrid`.
         table, levels: `Atlas.affine`, `Atlas.levels`.
         cells, face: the cells to draw and the face that each shows, shapes (n,).
         supersampling: samples per pixel and direction.
-        levels_per_octave: of the atlas.
+        levels_per_octave: `LEVELS_PER_OCTAVE` of the atlas.
         out: filled with (sx, ox, sy, oy), float32, shape (n, 4).
     """
     footprint = texels_per_pixel(M, distance, texel, centres, pixel_angle, cells, face) / supersampling
@@ -194,33 +194,33 @@ def affine_of_cells_numpy(M: np.ndarray, distance: np.ndarray, texel: np.ndarray
 
 def texels_per_pixel(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, centres: np.ndarray, pixel_angle: np.ndarray,
                      cells: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Geometric mean of a pixel's footprint on faces, at the cells' centres, shape (n,); arguments as in `affine_of_cells`."""
+    """Return the geometric mean of a pixel's footprint on faces [texel] at cell centres, (n,); arguments as `affine_of_cells`."""
     inverse = np.maximum(np.einsum("ij,ij->i", M[face, 2], centres[cells]), 1e-3)
     slant = np.clip(inverse * distance[face], 0.02, 1.0)  # cosine between ray and normal
     return pixel_angle[cells] / (inverse * texel[face] * np.sqrt(slant))
 
 
 def faces_behind_numpy(M: np.ndarray, room: np.ndarray, corners: np.ndarray, cells: np.ndarray, shown: np.ndarray) -> None:
-    """The faces of the room behind everything else, cell by cell.
+    """Find the faces of the room that are behind everything else, cell by cell.
 
     Args:
-        M: of the faces, see `View`, float32, shape (faces, 3, 3).
+        M: matrices of the faces, see `View`, float32, shape (faces, 3, 3).
         room: the faces without edges, shape (r,).
         corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
-        cells: the cells asked for, shape (n,).
-        shown: set where a corner of the cell sees the face, shape (r, n) bool.
+        cells: the cells to examine, shape (n,).
+        shown: set where a corner of the cell shows the face, shape (r, n) bool.
     """
     behind = (M[room, 2] @ corners[cells]).argmax(axis=1)  # (n, 4)
     shown[behind, np.arange(len(cells))[:, None]] = True
 
 
 def place_texels_numpy(texels: np.ndarray, cells: np.ndarray, samples: int, image: np.ndarray) -> None:
-    """Texels, averaged per pixel, into the image's cells.
+    """Average texels per pixel and write them to the image's cells.
 
     Args:
         texels: uint8, shape (n, pixels of a cell * samples).
-        cells: where they belong, shape (n,).
-        samples: per pixel.
+        cells: cells of the texels, shape (n,).
+        samples: number of samples per pixel.
         image: uint8, shape (rows, size, columns, size) of cells.
     """
     size, cols = image.shape[1], image.shape[2]
@@ -231,10 +231,10 @@ def place_texels_numpy(texels: np.ndarray, cells: np.ndarray, samples: int, imag
 
 def uniform_samples_numpy(M: np.ndarray, affine: np.ndarray, corners: np.ndarray, cells: np.ndarray, face: np.ndarray,
                           weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-    """Atlas coordinates of the samples of cells that show one face each.
+    """Compute the atlas coordinates of the samples of cells that show one face each.
 
     Args:
-        M: of the faces, see `View`, float32, shape (faces, 3, 3).
+        M: matrices of the faces, see `View`, float32, shape (faces, 3, 3).
         affine: (sx, ox, sy, oy) of each cell's atlas level, shape (n, 4).
         corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
         cells, face: the cells to draw and the face that each shows, shapes (n,).
@@ -252,18 +252,18 @@ def uniform_samples_numpy(M: np.ndarray, affine: np.ndarray, corners: np.ndarray
 
 def nearer_samples_numpy(m: np.ndarray, half: np.ndarray, affine: np.ndarray, corners: np.ndarray, cells: np.ndarray,
                          rows: np.ndarray, weights: np.ndarray, nearest: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-    """Give one face the samples in which it is in front of the faces drawn so far.
+    """Assign to one face the samples in which it is in front of the faces processed so far.
 
     Args:
-        m: of the face, see `View`, float32, shape (3, 3).
+        m: matrix of the face, see `View`, float32, shape (3, 3).
         half: its half extents [m], infinite where it is not bounded, float32, shape (2,).
         affine: (sx, ox, sy, oy) of the atlas level in each row, shape (r, 4).
         corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
         cells: the cells to draw, shape (n,).
-        rows: those of `cells` in which the face may show, shape (r,).
+        rows: indices into `cells` of those in which the face may be visible, shape (r,).
         weights: of the corners at the samples, float32, shape (4, samples).
-        nearest, x, y: inverse range [1/m] and atlas coordinates [texel] of what is in front, float32, shape (n, samples);
-            changed where the face wins.
+        nearest, x, y: inverse range [1/m] and atlas coordinates [texel] of the front face, float32, shape (n, samples);
+            changed where this face is in front.
     """
     u, v, inverse = np.ascontiguousarray(np.matmul(m, corners[cells[rows]]).transpose(1, 0, 2)) @ weights
     before = nearest[rows]

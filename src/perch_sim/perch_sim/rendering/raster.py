@@ -1,7 +1,7 @@
-"""Draws the faces of a scene as one camera pose sees them: texture look-ups, cell by cell.
+"""Rasteriser for the faces of a scene as seen from one camera pose: texture look-ups, cell by cell.
 
-Cells that show one face take one sample per pixel from the level of the atlas that fits the distance; cells of the
-pad take several; cells in which faces meet decide for every sample which face is in front.
+In cells that show one face, one sample per pixel is taken from the atlas level that fits the distance; in cells of the
+pad, several; in cells where faces meet, the front face is determined for every sample.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ FINE_SAMPLES = 400_000  # the tags take fewer samples per pixel when they fill t
 
 
 class Rasterizer:
-    """Renders the flat faces of a scene for one camera; holds nothing that changes."""
+    """Renders the flat faces of a scene for one camera; has no mutable state."""
 
     def __init__(self, faces: FaceArrays, atlas: Atlas, camera: Camera, grid: CellGrid) -> None:
         self.faces, self.atlas, self.camera, self.grid = faces, atlas, camera, grid
         self._void = int(atlas.image[int(atlas.void[1]), int(atlas.void[0])])
 
     def draw(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray, region: Region) -> np.ndarray:
-        """Grey levels under full light, before the optics, uint8, shape (height, width); outside the region anything.
+        """Return grey levels under full light, before the optics, uint8, shape (height, width); undefined outside the region.
 
         Args:
             p_WC, R_WC: pose of the camera in W [m].
@@ -61,7 +61,7 @@ class Rasterizer:
             image[row, :, col, :] = level
 
     def _fine_supersampling(self, view: View, cells: np.ndarray) -> int:
-        """Samples per pixel and direction for the cells that show the pad."""
+        """Return the samples per pixel and direction for the cells that show the pad."""
         if not len(cells):
             return 1
         pad = np.full(len(cells), np.flatnonzero(self.faces.fine)[0])
@@ -72,7 +72,7 @@ class Rasterizer:
         return int(np.clip(wanted, 1, max(1, affordable)))
 
     def _affine(self, view: View, cells: np.ndarray, face: np.ndarray, supersampling: int) -> np.ndarray:
-        """(sx, ox, sy, oy) of the atlas level that fits each cell, shape (cells, 4): see `Atlas.affine`."""
+        """Return (sx, ox, sy, oy) of the atlas level that fits each cell, shape (cells, 4): see `Atlas.affine`."""
         out = np.empty((len(cells), 4), np.float32)
         affine_of_cells(view.M, view.distance, self.faces.texel, self.grid.centres, self.grid.pixel_angle, self.atlas.affine,
                         self.atlas.levels, cells, face, supersampling, LEVELS_PER_OCTAVE, out)
@@ -102,7 +102,7 @@ class Rasterizer:
         self._look_up(image, cells, x, y, supersampling)
 
     def _candidates(self, view: View, cells: np.ndarray) -> list[tuple[int, np.ndarray]]:
-        """Faces that may show in mixed cells, each with the rows of `cells` where it may."""
+        """Return the faces that may be visible in mixed cells, each with the rows of `cells` where it may be."""
         behind = np.zeros((len(self.faces.room), len(cells)), bool)
         faces_behind(view.M, self.faces.room, self.grid.corners, cells, behind)
         found = [(int(face), np.flatnonzero(rows)) for face, rows in zip(self.faces.room, behind) if view.front[face]]
@@ -111,7 +111,7 @@ class Rasterizer:
 
     def _look_up(self, image: np.ndarray, cells: np.ndarray, x: np.ndarray, y: np.ndarray,
                  supersampling: int) -> None:
-        """Texels at x, y (cells, samples), averaged per pixel, into the image's cells."""
+        """Write the texels at x, y (cells, samples), averaged per pixel, to the image's cells."""
         # remap wants sides below 32768, which whole cells in rows keep
         texels = cv2.remap(self.atlas.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         place_texels(texels, cells, supersampling**2, image)

@@ -29,24 +29,23 @@ Pose = tuple[np.ndarray, np.ndarray]  # p_WB (3,) [m], R_WB (3, 3)
 
 
 class Renderer:
-    """Camera images of a scene.
+    """Renders camera images of a scene.
 
-    An instance holds only what it was built from, so that several threads may call `render` at once; OpenCV
-    releases the interpreter lock in the parts that take the time. The same poses and the same state of `rng`
-    give the same bytes.
+    An instance has no mutable state, so that several threads may call `render` at once; OpenCV releases the
+    interpreter lock in the costly parts. The same poses and the same state of `rng` give the same bytes.
 
     Attributes:
-        exposure: what the exposure control chose for the scene's light; `exposure.time` [s] is the time over which
-            the poses of a frame are to be spread.
+        exposure: exposure that the exposure control sets for the scene's light; the poses of a frame are to be
+            spread over `exposure.time` [s].
     """
 
     def __init__(self, scene: Scene, mount: CameraMount, seed: int = 0) -> None:
         """Draw the textures and lay out the image.
 
         Args:
-            scene: what is seen; renderers of the same `Scene` object share its textures.
-            mount: the camera and its place on the body; `mount.colour` asks for rgb8.
-            seed: fixes the sensor's noise bank.
+            scene: scene to render; renderers of the same `Scene` object share its textures.
+            mount: the camera and its pose on the body; `mount.colour` selects rgb8.
+            seed: seed of the sensor's noise bank.
         """
         self.scene, self.mount = scene, mount
         self.exposure = control_exposure(mount, scene.light)
@@ -60,16 +59,16 @@ class Renderer:
 
     def render(self, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray = np.zeros(3),
                region: Region | None = None) -> np.ndarray:
-        """The image of one exposure.
+        """Return the image of one exposure.
 
         Args:
             poses: (p_WB [m], R_WB) of the body, evenly spread over the exposure, one or more.
-            rng: draws this frame's noise.
-            target_shift: displacement of the target panel and its pad from where the scene has them [m], shape (3,).
-            region: rows and columns that somebody looks at; the rest of the image stays black. None: all of it.
+            rng: random generator of this frame's noise.
+            target_shift: displacement of the target panel and its pad from their positions in the scene [m], shape (3,).
+            region: rows and columns to render; the rest of the image is black. None: all of it.
 
         Returns:
-            mono8, uint8 (height, width); rgb8, uint8 (height, width, 3), where the mount asks for colour.
+            mono8, uint8 (height, width); with `mount.colour` rgb8, uint8 (height, width, 3).
         """
         shift_W = np.asarray(target_shift, dtype=float)
         poses = [(np.asarray(p, dtype=float), np.asarray(R, dtype=float)) for p, R in poses]
@@ -83,7 +82,7 @@ class Renderer:
         return self._sensor.expose(light, rng, region)
 
     def _light(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray, region: Region | None = None) -> np.ndarray:
-        """What falls on a region of the lens at one instant, under the light that the exposure is made for, uint8."""
+        """Render a region at one instant, before the optics and under the light for which the exposure is set, uint8."""
         image = self._raster.draw(p_WC, R_WC, shift_W, region or self._whole)
         if self.mount.colour:
             image = cv2.LUT(cv2.merge([image] * 3), self._tint)
@@ -93,7 +92,7 @@ class Renderer:
         return image
 
     def _subframes(self, poses: list[Pose]) -> int:
-        """As many as the motion across the image during the exposure asks for."""
+        """Return the number of sub-frames that the motion across the image during the exposure requires."""
         if len(poses) < 2:
             return 1
         (p0, R0), (p1, R1) = (self.mount.pose(*pose) for pose in (poses[0], poses[-1]))
@@ -104,7 +103,7 @@ class Renderer:
 
 
 def spread(poses: list[Pose], count: int) -> list[Pose]:
-    """`count` poses at the middles of equal shares of the time that `poses` span evenly."""
+    """Return `count` poses at the middles of equal shares of the time that `poses` span evenly."""
     if len(poses) == 1:
         return poses * count
     out = []

@@ -1,4 +1,4 @@
-"""The scene that a scenario describes."""
+"""Construction of the scene that a scenario describes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ CABLE_SPACING = 0.25  # between the points of a cable's polyline [m]
 
 
 def build_scene(scenario: Scenario, seed: int = 0) -> Scene:
-    """Room, target panel with its pad, cables and light of a scenario.
+    """Return the scene of a scenario: room, target panel with its pad, cables and light.
 
     Args:
-        scenario: what is flown.
-        seed: draws the textures.
+        scenario: flight whose scene is built.
+        seed: seed of the textures.
 
     Raises:
         ConfigError: the scenario's board does not exist.

@@ -1,6 +1,6 @@
-"""What the cameras see: a room, the inclined panel with its pad, cables.
+"""Scene in front of the cameras: a room, the inclined panel with its pad, cables.
 
-A `Scene` is a frozen description; `Scene.faces()` breaks it into the flat rectangles that are drawn.
+A `Scene` is a frozen description; `Scene.faces()` decomposes it into the flat rectangles that are rendered.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class CableCurve:
     """A cable as a polyline in W.
 
     Attributes:
-        points_W: shape (n, 3) [m], dense enough for straight pieces.
+        points_W: shape (n, 3) [m], dense enough for straight pieces between them.
         radius: [m].
         colour: red, green, blue in [0, 255] under full light.
     """
@@ -37,7 +37,7 @@ class CableCurve:
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """A flat textured rectangle, seen only from the side its normal points to.
+    """A flat textured rectangle, visible only from the side to which its normal points.
 
     Attributes:
         centre_W: [m], shape (3,).
@@ -45,7 +45,7 @@ class Face:
         half: half extents along right and up [m].
         kind: `room`, `panel` or `pad`.
         texel: size of a texel [m].
-        bounded: whether the rectangle ends at its edges; a room's faces are ended by each other.
+        bounded: whether the rectangle ends at its edges; faces of the room are bounded by each other.
         moving: whether it moves with the target.
     """
 
@@ -66,7 +66,7 @@ class Face:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything that can be seen.
+    """Description of everything visible.
 
     Attributes:
         room_low, room_high: opposite corners of the room in W [m], shape (3,).
@@ -74,8 +74,8 @@ class Scene:
         board: the tags on the pad, in the middle of the target panel.
         cables: cables.
         contrast: Michelson contrast of the textures: 99 % of the texels lie within mean (1 +- contrast).
-        light: brightness of the light; 1 is what the cameras' default exposure is made for.
-        seed: draws the textures.
+        light: brightness of the light; the cameras' default exposure is set for 1.
+        seed: seed of the textures.
     """
 
     room_low: np.ndarray
@@ -100,7 +100,7 @@ class Scene:
             raise ConfigError("Scene", "board", "a board needs a target panel that carries it")
 
     def faces(self) -> tuple[Face, ...]:
-        """All rectangles, the six of the room first."""
+        """Return all rectangles, the six of the room first."""
         faces = list(_room_faces(self.room_low, self.room_high))
         if self.target is not None:
             faces += _panel_faces(self.target, depth=PAD_THICKNESS if self.board else 0.0)
@@ -117,7 +117,7 @@ def _surface_face(surface: PerchSurface, kind: str, texel: float) -> Face:
 
 
 def _panel_faces(panel: PerchSurface, depth: float) -> list[Face]:
-    """Front and back of a thin panel whose front lies `depth` behind the surface's plane."""
+    """Return front and back of a thin panel whose front lies `depth` behind the surface's plane."""
     centre = panel.p_WS - depth * panel.normal
     front = _surface_face(PerchSurface(centre, panel.R_WS, panel.size), "panel", PANEL_TEXEL)
     back = Face(centre, -front.right_W, front.up_W, front.half, "panel", WALL_TEXEL, moving=True)
@@ -125,7 +125,7 @@ def _panel_faces(panel: PerchSurface, depth: float) -> list[Face]:
 
 
 def _room_faces(low: np.ndarray, high: np.ndarray) -> list[Face]:
-    """Floor, ceiling and four walls, normals inward."""
+    """Return floor, ceiling and four walls, with inward normals."""
     centre, half = (low + high) / 2, (high - low) / 2
     length, width, height = high - low
     walls = length * width + 2 * (length + width) * height

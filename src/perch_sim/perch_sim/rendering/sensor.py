@@ -1,7 +1,7 @@
-"""From light to grey levels: lens blur, vignetting, exposure control, shot and read noise.
+"""Conversion of light to grey levels: lens blur, vignetting, exposure control, shot and read noise.
 
-The noise comes from a bank that is drawn once and shifted at random for every frame: 300,000 Gaussian numbers per
-frame would cost more than everything else.
+The noise is taken from a bank that is drawn once and shifted at random for every frame: 300,000 Gaussian numbers per
+frame would cost more than all other steps.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ BANK_MARGIN = 256  # room for the random shift of the noise [px]
 
 @dataclass(frozen=True)
 class Exposure:
-    """What the driver's exposure control settles at.
+    """Steady state of the driver's exposure control.
 
     Attributes:
         time: exposure time [s].
         gain: analogue gain.
-        brightness: grey level relative to what textures hold.
+        brightness: grey level relative to that of the textures.
     """
 
     time: float
@@ -40,7 +40,7 @@ class Exposure:
 
 
 def control_exposure(mount: CameraMount, light: float) -> Exposure:
-    """Keep the image's brightness: in the dark expose longer, then amplify; in bright light expose shorter."""
+    """Return the exposure that keeps the image's brightness: in the dark longer, then with more gain; in bright light shorter."""
     time = float(np.clip(mount.exposure / light, 0.05 * mount.exposure, mount.exposure_max))
     wanted = BASE_GAIN * mount.exposure / (light * time)
     gain = float(np.clip(wanted, *GAIN_RANGE))
@@ -48,7 +48,7 @@ def control_exposure(mount: CameraMount, light: float) -> Exposure:
 
 
 class Sensor:
-    """A camera's imperfections, fixed by a seed; holds nothing that changes from frame to frame."""
+    """Imperfections of a camera, determined by a seed; has no mutable state."""
 
     def __init__(self, camera: Camera, exposure: Exposure, channels: int, seed: int) -> None:
         rng = np.random.default_rng([seed, 1])
@@ -64,16 +64,16 @@ class Sensor:
         self._size = (camera.height, camera.width)
 
     def lit(self, region: Region) -> Region:
-        """What falls on a region and, blurred, around it."""
+        """Return a region widened by the reach of the blur."""
         rows, cols = (slice(max(part.start - BLUR_REACH, 0), min(part.stop + BLUR_REACH, size)) for part, size in zip(region, self._size))
         return rows, cols
 
     def expose(self, light: np.ndarray, rng: np.random.Generator, region: Region | None = None) -> np.ndarray:
-        """A noisy image of what falls on the sensor, uint8, black outside the region.
+        """Return the noisy image of the light on the sensor, uint8, black outside the region.
 
         Args:
-            light: uint8, shape (height, width) or (height, width, 3), before the optics; must hold within `lit(region)`.
-            rng: draws this frame's noise.
+            light: uint8, shape (height, width) or (height, width, 3), before the optics; must be valid within `lit(region)`.
+            rng: random generator of this frame's noise.
             region: rows and columns that are read out; None: all.
         """
         region = region or (slice(0, self._size[0]), slice(0, self._size[1]))

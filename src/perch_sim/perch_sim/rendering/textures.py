@@ -18,10 +18,10 @@ OVERSAMPLING = 4  # of what is printed, in each direction: edges that fall betwe
 
 
 def blobs(rng: np.random.Generator, rows: int, cols: int, texel: float, contrast: float) -> np.ndarray:
-    """A random texture with corners at every scale.
+    """Return a random texture with corners at every scale.
 
     Args:
-        rng: draws it.
+        rng: random generator.
         rows, cols: size [texels].
         texel: size of a texel [m].
         contrast: 99 % of the texels lie within mean (1 +- contrast).
@@ -48,12 +48,12 @@ def blobs(rng: np.random.Generator, rows: int, cols: int, texel: float, contrast
 
 
 def pad(board: TagBoard, texel: float, rng: np.random.Generator) -> np.ndarray:
-    """The pad seen from outside, s1 up: black tags on white margins of one module, dark velcro between them.
+    """Return the pad as seen from outside, s1 up: black tags on white margins of one module, dark velcro between them.
 
     Args:
-        board: what is printed.
+        board: tags that are printed.
         texel: size of a texel [m].
-        rng: draws the fleece of the velcro.
+        rng: random generator of the velcro's fleece.
 
     Returns:
         uint8, shape (rows, cols): rows run along -s1, columns along -s2.
@@ -67,10 +67,10 @@ def pad(board: TagBoard, texel: float, rng: np.random.Generator) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def _print(board: TagBoard, rows: int, cols: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the tags put on a pad, the same in every flight.
+    """Render the printed tags of a pad, which are the same in every flight.
 
     Returns:
-        Grey levels summed over the samples of each texel that tags cover, and the number of those that they leave bare,
+        Grey levels summed over those samples of each texel that are printed, and the number of samples that are not,
         uint16 (rows, cols).
     """
     extent, shape = np.array(board.pad_size), (rows * OVERSAMPLING, cols * OVERSAMPLING)

@@ -1,8 +1,8 @@
-"""Which face each cell of the image shows, as seen from one camera pose.
+"""Visibility: which face each cell of the image shows, for one camera pose.
 
 For a face with normal n at the signed distance d = n . (o - c) from the camera, the inverse range along a unit ray
 r is (n . r)/d: linear in the ray, and largest for the face in front. Texture coordinates are u = (M0 . r)/(M2 . r)
-and v = (M1 . r)/(M2 . r) with M2 the inverse range, so one 3 x 3 matrix per face holds everything.
+and v = (M1 . r)/(M2 . r), where M2 . r is the inverse range, so one 3 x 3 matrix per face is sufficient.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class FaceArrays:
         centre_W, right_W, up_W, normal_W: shape (n, 3).
         half: half extents, shape (n, 2) [m]; infinite where the face is not bounded.
         texel: [m], shape (n,).
-        moving, fine: bool, shape (n,): moves with the target; drawn with several samples per pixel.
-        bounded: indices of the faces with edges, shape (m,); room: of the others.
-        row: place of each face in `bounded`, -1 for those without edges, shape (n,).
-        edges_W: points on their edges, shape (m, 4 * EDGE_SAMPLES, 3).
+        moving, fine: bool, shape (n,): moves with the target; rendered with several samples per pixel.
+        bounded, room: indices of the faces with edges, shape (m,); indices of the others.
+        row: index of each face in `bounded`, -1 for those without edges, shape (n,).
+        edges_W: points on the edges of the bounded faces, shape (m, 4 * EDGE_SAMPLES, 3).
     """
 
     centre_W: np.ndarray
@@ -49,7 +49,7 @@ class FaceArrays:
 
     @classmethod
     def of(cls, faces: tuple[Face, ...]) -> FaceArrays:
-        """From the faces of a scene."""
+        """Return the arrays of the faces of a scene."""
         bounded = [i for i, face in enumerate(faces) if face.bounded]
         edges = [_edge_points(faces[i]) for i in bounded]
         row = np.full(len(faces), -1)
@@ -73,12 +73,12 @@ def _edge_points(face: Face) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The faces as one camera pose sees them.
+    """Faces of a scene as seen from one camera pose.
 
     Attributes:
-        M: ray in C -> (u/range, v/range, 1/range), float32, shape (n, 3, 3); zero for faces that turn away.
-        distance: of the camera from each face's plane [m], shape (n,).
-        front: faces that turn towards the camera, shape (n,) bool.
+        M: ray in C -> (u/range, v/range, 1/range), float32, shape (n, 3, 3); zero for faces that face away.
+        distance: distance of the camera from each face's plane [m], shape (n,).
+        front: whether a face is turned towards the camera, shape (n,) bool.
         first: face that each cell shows at its first corner (-1: none), shape (cells,).
         uniform: whether the cell shows that face alone, shape (cells,) bool.
         shown: for each bounded face, the cells that one of its edges crosses or in which a corner's ray hits it, shape
@@ -95,7 +95,7 @@ class View:
 
 def face_matrices(faces: FaceArrays, p_WC: np.ndarray, R_WC: np.ndarray,
                   shift_W: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """M (n, 3, 3), distances (n,) [m] and the mask of faces that turn towards the camera: see `View`."""
+    """Return M (n, 3, 3), distances (n,) [m] and the mask of faces turned towards the camera: see `View`."""
     offset = p_WC - faces.centre_W - faces.moving[:, None] * shift_W  # from the face's centre to the camera
     distance = np.sum(faces.normal_W * offset, axis=1)
     front = distance > NEAREST
@@ -110,10 +110,10 @@ def face_matrices(faces: FaceArrays, p_WC: np.ndarray, R_WC: np.ndarray,
 
 def look(faces: FaceArrays, grid: CellGrid, camera: Camera, p_WC: np.ndarray, R_WC: np.ndarray,
          shift_W: np.ndarray) -> View:
-    """What the corners of the cells see, and which cells the edges of faces cross.
+    """Return the face that each cell shows, and the cells that edges of faces cross.
 
     Args:
-        faces: what there is.
+        faces: faces of the scene.
         grid, camera: cells of the image and their camera.
         p_WC, R_WC: pose of the camera in W [m].
         shift_W: displacement of the moving faces [m], shape (3,).

@@ -1,1 +1,1 @@
-"""The lockstep over ROS: the vehicle's node, which owns the schedule, and the node of every participant."""
+"""Lockstep over ROS: the vehicle's node, which owns the schedule, and the node of every participant."""

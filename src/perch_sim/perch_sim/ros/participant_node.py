@@ -1,8 +1,8 @@
-"""The lockstep host: a node whose inputs are ordered by the simulator's schedule.
+"""Lockstep host: a node whose inputs are ordered by the simulator's schedule.
 
-It is the same component with the same outputs, services and actions as in the arrival host. Its inputs come from the vehicle's
-node: in this process as values, from another as batches of serialised messages over a local socket. What it publishes goes
-back the same way, and on its topics for everybody else; nothing that others publish there has any influence.
+Component, outputs, services and actions are the same as in the arrival host. The inputs are sent by the vehicle's node: as values
+within one process, otherwise as batches of serialised messages over a local socket. Outputs return the same way, and are
+also published on their topics. Messages of nodes outside the lockstep are ignored, except on topics that are only recorded.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ OBSERVED = ("/diagnostics", "/tf", "/tf_static", "robot_description")  # taken a
 
 
 class ParticipantNode(ComponentNode):
-    """One component that takes part in the lockstep."""
+    """Node with one component that takes part in the lockstep."""
 
     def __init__(self, name: str, component: type[Component], wiring: Wiring, **kwargs: Any) -> None:
         """
@@ -54,7 +54,7 @@ class ParticipantNode(ComponentNode):
         self._intake = Intake(self)
         self._asking: dict[str, Callable[[Any, int], None]] = {}
         self._open: defaultdict[str, deque[tuple[Answer, float]]] = defaultdict(deque)
-        """Channel -> its requests without an answer, each with its time on the monotonic clock [s]: a server answers in their order."""
+        """Channel -> unanswered requests, each with its time on the monotonic clock [s]; a server answers them in order."""
         self._busy = False  # with a batch
         self._vehicle: Any = None  # the connection to it, where there is one
         self._waiting = Waiting()
@@ -62,7 +62,7 @@ class ParticipantNode(ComponentNode):
         wiring.participants[name] = self.participant
 
     def connect(self) -> None:
-        """Join the vehicle of this process, or greet that of another."""
+        """Offer services and connect clients; if the vehicle is in another process, connect to it."""
         asks = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
         connect_clients(self, self.component, self._deliver_answer)
         self._asking = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
@@ -86,7 +86,7 @@ class ParticipantNode(ComponentNode):
     # -- batches from another process --------------------------------------------------------------------------------
 
     def _knock(self) -> None:
-        """Look for the vehicle, as long as there is no connection to it."""
+        """Try to connect to the vehicle, unless connected."""
         if self._vehicle is None:
             self._vehicle = knock(self._where, self.get_name(), self.participant.inputs)
             if self._vehicle is not None:
@@ -94,7 +94,7 @@ class ParticipantNode(ComponentNode):
                 self.wiring.from_thread(self._work_on)
 
     def _work_on(self) -> None:
-        """Work on what comes; then other events, then what comes next."""
+        """Process up to `BURST` batches, then let the executor process other events first."""
         for _ in range(BURST):
             if not self._waiting.ready(PATIENCE):
                 break
@@ -111,7 +111,7 @@ class ParticipantNode(ComponentNode):
         self.wiring.from_thread(self._work_on)
 
     def _go_on(self) -> None:
-        """Give the results, where the batch is finished; one that waits for something is looked at again."""
+        """Send the results of a finished batch; check an unfinished one again later."""
         if not self._busy:
             return
         packets = self.participant.results()
@@ -131,7 +131,7 @@ class ParticipantNode(ComponentNode):
             self.wiring.from_thread(self._work_on)
 
     def _results(self, results: Callable[[], list[Packet] | None]) -> list[Packet] | None:
-        """Those of the participant; what raises is said and dropped, and the rest goes on."""
+        """Return the participant's results; an exception is logged, its packet is dropped, and the batch continues."""
         while True:
             try:
                 return results()
@@ -139,7 +139,7 @@ class ParticipantNode(ComponentNode):
                 self.refused("step", error)
 
     def _leave(self) -> None:
-        """The vehicle has gone; another one may come."""
+        """Close the connection to a vehicle that has ended; another one may be found later."""
         self._busy = False
         self._waiting.remove(self._vehicle)
         self._vehicle = None
@@ -147,7 +147,7 @@ class ParticipantNode(ComponentNode):
     # -- requests ----------------------------------------------------------------------------------------------------
 
     def bring(self, port: Service | Action, work: Callable[..., None], *arguments: Any) -> None:
-        """In front of the next batch, which may have waited for it."""
+        """Schedule a request or a goal in front of the next batch, which may be waiting for it."""
         self.participant.enter(port.name, partial(self.guarded, port.name, work, *arguments))
         self._progress()
 
@@ -155,7 +155,7 @@ class ParticipantNode(ComponentNode):
         return list(ports(type(self.component), Client))
 
     def _ask(self, channel: str, request: Any) -> Answer:
-        """Send a component's request by its service; the answer is handed over by the participant when it counts."""
+        """Send a component's request to its service; the participant delivers the answer when it is due."""
         answer = Answer()
         self._open[channel].append((answer, time.monotonic()))
         self._asking[channel](request, 0)
@@ -168,7 +168,7 @@ class ParticipantNode(ComponentNode):
         self._progress()
 
     def _give_up(self) -> None:
-        """A request that was under way when its server ended is never answered; the flight must not wait for ever."""
+        """Answer overdue requests with `Unavailable`: their servers may have ended, and the flight must not wait for ever."""
         for channel, waiting in tuple(self._open.items()):
             if waiting and time.monotonic() - waiting[0][1] > ANSWERED:
                 self.get_logger().error(f"{channel} has not answered for {ANSWERED:g} s: its answer is given up")
@@ -176,7 +176,7 @@ class ParticipantNode(ComponentNode):
                 self._progress()
 
     def _progress(self) -> None:
-        """What the present batch waits for may have come."""
+        """Continue the present batch, as something for which it waits may have arrived."""
         if self.wiring.schedule_here:
             self.wiring.progress()
         else:

@@ -1,4 +1,4 @@
-"""Participants in other processes, as the schedule sees them."""
+"""Proxies of participants in other processes, for the schedule."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from perch_sim.lockstep.link import Sending, pack, unpack
 
 
 class RemoteParticipant(Participant):
-    """Batches go out over a connection, results come back.
+    """Sends batches over a connection, and receives results.
 
     Attributes:
-        gone: its process has ended, or has closed the connection.
+        gone: whether the process has ended or has closed the connection.
     """
 
     def __init__(self, name: str, inputs: frozenset[str], connection: Connection) -> None:
@@ -34,18 +34,18 @@ class RemoteParticipant(Participant):
             self.gone = True
 
     def go_on(self) -> None:
-        """Send the rest of a batch to a process that has not read."""
+        """Send the rest of a batch to a process that did not read all of it."""
         try:
             self._sending.go_on()
         except OSError:
             self.gone = True
 
     def close(self) -> None:
-        """Nothing is sent any more."""
+        """Close the sending side of the connection."""
         self._sending.close()
 
     def receive(self) -> None:
-        """Take what has come."""
+        """Receive the results of a batch; set `gone` if the connection has ended."""
         try:
             _, packets = unpack(self.connection.recv_bytes(), topics)
         except (OSError, EOFError, PerchError):
@@ -54,10 +54,10 @@ class RemoteParticipant(Participant):
             self._results = [packet for packet in packets if self._taken(packet.channel)]
 
     def results(self) -> list[Packet] | None:
-        """What it has made of the batch."""
+        """Return the results of the batch, once; None if they have not arrived."""
         results, self._results = self._results, None
         return results
 
     def listen(self, taken: Callable[[str], bool]) -> None:
-        """Packets that nobody takes end here."""
+        """Set the check whether a channel has a receiver; received packets without one are dropped."""
         self._taken = taken

@@ -1,4 +1,4 @@
-"""The vehicle in lockstep: it owns the schedule, and goes on when everybody has done what counts by the next step."""
+"""Node of the vehicle in lockstep: owns the schedule, and advances when all results that are due have arrived."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SETTLED_LOOKS = 3   # everybody has to be there this often in a row before the f
 
 
 class VehicleNode(ComponentNode):
-    """`SimulatedVehicle` with its schedule."""
+    """Node of `SimulatedVehicle` with its schedule."""
 
     component: Any  # a `perch_sim.lockstep.schedule.Vehicle` that says whether it is ready, and diagnoses itself
 
@@ -61,7 +61,7 @@ class VehicleNode(ComponentNode):
         wiring.schedule_here, wiring.progress = True, self._advance
 
     def connect(self) -> None:
-        """Take in who shares the process, and wait for the others."""
+        """Join the participants of this process, and wait for the others."""
         for name, participant in self.wiring.participants.items():
             if name in self._expected:
                 self._schedule.join(participant)
@@ -70,7 +70,7 @@ class VehicleNode(ComponentNode):
         self.create_timer(1.0, self._diagnose, clock=self._steady)
 
     def _emitted(self, topic: str, publication: Publication):
-        """Images go to neighbours and out when they have been drawn."""
+        """Return the function that emits a value; images are emitted when they have been rendered."""
         usual = super()._emitted(topic, publication)
 
         def publish(value: Any) -> None:
@@ -85,7 +85,7 @@ class VehicleNode(ComponentNode):
     # -- participants ------------------------------------------------------------------------------------------------
 
     def _let_in(self) -> None:
-        """Take in who has come; one that had been here takes its own place."""
+        """Accept participants that connect; one that reconnects replaces its former connection."""
         for name, inputs, connection in self._door.let_in():
             if name not in self._expected:
                 self.warn_once(f"lockstep: {name!r} wants to take part but is not in the parameter participants: it is ignored")
@@ -104,7 +104,7 @@ class VehicleNode(ComponentNode):
                 self.get_logger().warning(f"lockstep: {name} is back")
 
     def _receive(self, timeout: float) -> bool:
-        """Take results that have come, or come in time [s]."""
+        """Receive results that arrive within a time [s]; return whether there were any."""
         for one in self._remote.values():
             one.go_on()
         connections = self._links.ready(timeout)
@@ -118,19 +118,19 @@ class VehicleNode(ComponentNode):
         return bool(connections)
 
     def _missing(self) -> list[str]:
-        """Who has not come yet."""
+        """Return the expected participants that have not connected yet."""
         here = set(self._schedule.names) | set(self._remote) | self._dropped
         return [name for name in self._expected if name not in here]
 
     # -- going on ----------------------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        """Go as far as the participants allow."""
+        """Advance the flight as far as the participants permit."""
         if self._started and not self._again:
             self.wiring.enter(self.guarded, "advance", self._burst)
 
     def _burst(self) -> None:
-        """Some steps, then other events, then the next."""
+        """Advance up to `BURST` steps, then let the executor process other events first."""
         schedule = self._schedule
         for _ in range(BURST):
             if not self._in_time():
@@ -155,7 +155,7 @@ class VehicleNode(ComponentNode):
         self.guarded("advance", self._burst)
 
     def _in_time(self) -> bool:
-        """A flight that no controller leads keeps to the wall clock instead of running away."""
+        """Return whether the next step is due: a flight without controller is paced by the wall clock."""
         if "controller" in self._schedule.names:
             self._pacing = None
             return True
@@ -180,7 +180,7 @@ class VehicleNode(ComponentNode):
     # -- the silent --------------------------------------------------------------------------------------------------
 
     def _look_after(self) -> None:
-        """Start the flight when all have come; name who is waited for, and drop the silent."""
+        """Start the flight when all participants have connected; report and drop silent participants."""
         now = time.monotonic()
         self._let_in()
         if not self._started:
@@ -191,7 +191,7 @@ class VehicleNode(ComponentNode):
         self._advance()
 
     def _waiting(self) -> str:
-        """Who is waited for, with what it owes."""
+        """Describe what the flight waits for: participants, and what each owes."""
         if not self._started:
             missing = self._missing()
             if missing:
@@ -237,7 +237,7 @@ class VehicleNode(ComponentNode):
         one.close()
 
     def _look_for_strangers(self) -> None:
-        """Name who publishes on topics of the flight without taking part: in lockstep that has no influence."""
+        """Warn of nodes that publish on topics of the flight without taking part; their messages are ignored."""
         inputs = set().union(*(one.inputs for one in (*self._remote.values(), *self.wiring.participants.values())))
         inputs = (inputs - set(SHARED)) | {"motor_command"}
         known = {f"{self.get_namespace().rstrip('/')}/{name}" for name in (*self._expected, self.get_name())}
@@ -246,14 +246,14 @@ class VehicleNode(ComponentNode):
                 self.warn_once(f"{channel}: {stranger} publishes it but takes no part in the lockstep: it is ignored")
 
     def close(self) -> None:
-        """Let nobody in any more."""
+        """Stop accepting participants, and release the node's resources."""
         self._door.close()
         super().close()
 
     # -- people ------------------------------------------------------------------------------------------------------
 
     def host_figures(self) -> dict[str, Any]:
-        """How fast simulation time passes, and who is waited for."""
+        """Return the speed of simulation time, and what the flight waits for."""
         now, steps = time.monotonic(), self._schedule.index
         since, before = self._counted
         self._counted = (now, steps)
@@ -261,5 +261,5 @@ class VehicleNode(ComponentNode):
         return {"steps_per_s": rate, "real_time_factor": rate * CONTROL_PERIOD, "waiting_for": self._waiting()}
 
     def _diagnose(self) -> None:
-        """Once a second of wall-clock time: simulation time may stand still."""
+        """Emit diagnostics; called each second of wall-clock time, as simulation time may stand still."""
         self.component.diagnose()
