@@ -66,7 +66,7 @@ class VirtualView:
         return (rays_V / np.linalg.norm(rays_V, axis=-1, keepdims=True)) @ self.R_CV.T
 
     def region(self, camera: Camera, margin: int) -> Region:
-        """Return the part of a camera's image that the view shows, plus `margin` [px]; all of it where the view exceeds the lens."""
+        """Return the region of an image that the view shows, plus `margin` [px]; all of it where the view exceeds the lens."""
         pixels, valid = camera.project(self.rays(self.centre + 0.5 * self.side * _BORDER))
         if not valid.all():
             return slice(0, camera.height), slice(0, camera.width)
