@@ -88,8 +88,8 @@ class SupervisedLoop(FirmwareLoop):
         if now >= self._supervisor._due:  # a frame counts from the cycle on that follows its answer
             self._answers.clear()
             self._supervisor.work(0.0)
-            if self.watchdog.begun:
-                self._answered({msp.SET_RAW_RC, msp.ATTITUDE} if self.watchdog.levels(now) else {msp.SET_RAW_RC})
+            if self.watchdog.command_received:
+                self._answered({msp.SET_RAW_RC, msp.ATTITUDE} if self.watchdog.needs_attitude(now) else {msp.SET_RAW_RC})
         else:
             self._supervisor.work(0.0)
         return tuple(self.radio)

@@ -14,7 +14,7 @@ from perch_eval.goal import goal_of
 from perch_eval.in_process.flights import Sensing, arrange
 from perch_eval.in_process.loop import SentGoal
 from perch_eval.in_process.parameters import NodeParameters
-from perch_sim.drawing import DrawnOnDemand
+from perch_sim.drawing import OnDemandRendering
 from perch_sim.parameters import VehicleParameters
 from perch_sim.scenario import Scenario, load_scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
@@ -55,7 +55,7 @@ def component(flight: str, name: str) -> Component[Any]:
     """A component as it begins a flight."""
     scenario = scenario_of(flight)
     if name == "vehicle":
-        return SimulatedVehicle(VehicleParameters(seed=SEED, cameras="none"), scenario, DrawnOnDemand)
+        return SimulatedVehicle(VehicleParameters(seed=SEED, cameras="none"), scenario, OnDemandRendering)
     made = NodeParameters(scenario, SEED).component(name)
     made.warm_up()
     for port in ports(type(made), Client):

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Timer
 from perch_core.errors import PerchError
 from perch_core.values import CameraImage
-from perch_sim.lockstep import Answer, Arrival, LocalParticipant, Owed, Packet, Schedule, Task, local_servers
+from perch_sim.lockstep import Answer, Arrival, LocalParticipant, Packet, PendingInput, Schedule, Task, local_servers
 from perch_sim.lockstep.link import pack, unpack
-from perch_sim.pacing import LONGEST_CATCH_UP, Pacing
+from perch_sim.pacing import MAX_CATCH_UP, Pacing
 
 MS = 1_000_000
 STEP = 2 * MS
@@ -151,8 +151,8 @@ class Logged:
             return None
         return self.inner.results()
 
-    def listen(self, taken):
-        self.inner.listen(taken)
+    def set_channel_filter(self, is_taken):
+        self.inner.set_channel_filter(is_taken)
 
 
 def tasks(vio: int, mission: int) -> dict[str, Task]:
@@ -183,7 +183,7 @@ def flown(latencies, every, waits, events=(), steps=60, draw=None):
         for _ in range(10_000):
             if schedule.advance():
                 break
-            assert schedule.owed()
+            assert schedule.pending()
         else:
             raise AssertionError("it waits for ever")
         assert schedule.index == index + 1
@@ -257,7 +257,7 @@ def test_a_fast_participant_that_is_silent_is_named_and_the_flight_goes_on_witho
     assert schedule.advance()
     mute.dead = True
     assert not schedule.advance() and not schedule.advance()
-    assert schedule.owed() == [Owed("controller", "its answer to the present step", 2 * STEP)]
+    assert schedule.pending() == [PendingInput("controller", "its answer to the present step", 2 * STEP)]
     schedule.drop("controller")
     assert schedule.advance() and schedule.advance() and schedule.names == ["estimator"]
 
@@ -281,7 +281,7 @@ def test_a_slow_one_that_hangs_is_named_with_the_trigger_of_what_it_owes():
     while schedule.advance():
         steps += 1
     assert steps == 5  # the frame of step 3, exposed at 2 ms, counts from 12 ms, step 6
-    assert schedule.owed() == [Owed("vio", "its results", 3 * STEP)]
+    assert schedule.pending() == [PendingInput("vio", "its results", 3 * STEP)]
     schedule.drop("vio")
     assert all(schedule.advance() for _ in range(20))
 
@@ -314,7 +314,7 @@ def test_the_flight_waits_for_the_third_undrawn_image_of_a_camera_even_where_nob
     drawn: set[int] = set()
     schedule = Schedule(Vehicle(every=2, draw=lambda t: (np.zeros((1, 1), np.uint8), lambda timeout: t in drawn)), [], tasks(10, 10))
     assert all(schedule.advance() for _ in range(5)) and not schedule.advance()
-    assert schedule.owed() == [Owed("camera_down", "an image", 2 * STEP)] and schedule.await_image(0.0)
+    assert schedule.pending() == [PendingInput("camera_down", "an image", 2 * STEP)] and schedule.await_image(0.0)
     drawn.add(2 * STEP)
     assert schedule.advance() and not schedule.await_image(0.0)
 
@@ -370,7 +370,7 @@ def said(participant, now, *numbers):
 
 
 def test_answers_come_in_the_first_batch_in_which_they_count():
-    asking = LocalParticipant(Asking(Nothing()), ask=local_servers([LocalParticipant(Planner(Nothing()))]))
+    asking = LocalParticipant(Asking(Nothing()), send_request=local_servers([LocalParticipant(Planner(Nothing()))]))
     assert asking.name == "asking"
     assert said(asking, 0, 30 * MS) == ["tick 0"]
     assert said(asking, 20 * MS) == ["tick 20000000"]
@@ -385,7 +385,7 @@ def test_a_batch_waits_for_an_answer_that_counts_from_its_stamp_or_before():
         answers.append(Answer())
         return answers[-1]
 
-    asking = LocalParticipant(Asking(Nothing()), ask=ask)
+    asking = LocalParticipant(Asking(Nothing()), send_request=ask)
     assert said(asking, 0, 30 * MS) == ["tick 0"] and said(asking, 20 * MS) == ["tick 20000000"]
     assert said(asking, 40 * MS) is None and asking.results() is None
     answers[0]("there")
@@ -393,29 +393,29 @@ def test_a_batch_waits_for_an_answer_that_counts_from_its_stamp_or_before():
 
 
 def test_servers_that_are_missing_or_fail_answer_all_the_same():
-    asking = LocalParticipant(Asking(Nothing()), ask=local_servers([]))
+    asking = LocalParticipant(Asking(Nothing()), send_request=local_servers([]))
     said(asking, 0, 1)
-    assert said(asking, 2)[0] == "answer nobody serves 'plan_perch'"
+    assert said(asking, 2)[0] == "answer no server for 'plan_perch'"
     failed = Answer()
     failed.result = lambda: 1 // 0
     failed(0)
-    asking = LocalParticipant(Asking(Nothing()), ask=lambda channel, request: failed)
+    asking = LocalParticipant(Asking(Nothing()), send_request=lambda channel, request: failed)
     said(asking, 0, 1)
     assert said(asking, 2)[0].startswith("answer ZeroDivisionError")
 
 
 def test_a_first_batch_waits_for_the_goal_that_holds_it_and_goals_go_in_front_of_batches():
-    asking, verdicts = LocalParticipant(Asking(Nothing()), hold="perch"), []
+    asking, verdicts = LocalParticipant(Asking(Nothing()), await_goal="perch"), []
     assert said(asking, 0) is None
     asking.goal("perch", 1, verdicts.append)
     assert [packet.value for packet in asking.results()] == ["goal 1", "tick 0"]
     asking.goal("perch", -1, verdicts.append)
     assert said(asking, 20 * MS) == ["goal -1", "tick 20000000"] and verdicts == ["", "not positive"]
-    early = LocalParticipant(Asking(Nothing()), hold="perch")
+    early = LocalParticipant(Asking(Nothing()), await_goal="perch")
     early.goal("perch", 2)
     assert said(early, 0) == ["goal 2", "tick 0"]
     with pytest.raises(PerchError, match="'park' is none of its"):
-        LocalParticipant(Asking(Nothing()), hold="park")
+        LocalParticipant(Asking(Nothing()), await_goal="park")
 
 
 def test_packets_make_the_form_that_is_asked_for_once():
@@ -444,7 +444,7 @@ def test_pacing_keeps_up_with_the_clock_or_says_what_it_gave_up(waits):
     for wait in waits:
         now += wait
         due = pacing.due(now)
-        assert 0 <= due <= LONGEST_CATCH_UP
+        assert 0 <= due <= MAX_CATCH_UP
         done += due
         assert done + pacing.skipped == (now - 1000) // period  # every period is done or owned up to
     assert pacing.misses >= pacing.skipped

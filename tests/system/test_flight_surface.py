@@ -132,7 +132,7 @@ def test_one_process_per_node_in_a_crowd_is_the_same_flight(flight, crowd, tmp_p
         pytest.fail(first_difference(RecordedFlight(folder / "flight.mcap"), RecordedFlight(tmp_path / "flight.mcap")))
     log = (tmp_path / "logs" / "vehicle.log").read_text()
     for topic in ("trajectory", "controller/command", "motor_command", "odometry", "imu/data_raw"):
-        assert log.count(f"[vehicle]: {topic}: /stranger publishes it but takes no part in the lockstep: it is ignored") == 1, topic
+        assert log.count(f"[vehicle]: {topic}: /stranger publishes it but is not a participant of the lockstep: ignored") == 1, topic
 
 
 def test_without_ros_and_with_sums_on_two_threads_it_is_the_same_flight(flight):

@@ -20,11 +20,11 @@ def domain(ros_domain):
 
 def killed(flight: Rig, name: str):
     """Kill a node and start it again; then it is there."""
-    gone, back = flight.said(f"lockstep: {name} is gone"), flight.said(f"lockstep: {name} is back")
+    gone, back = flight.said(f"lockstep: {name} has disconnected"), flight.said(f"lockstep: {name} has reconnected")
     flight.kill(name)
-    yield lambda: flight.said(f"lockstep: {name} is gone") > gone
+    yield lambda: flight.said(f"lockstep: {name} has disconnected") > gone
     flight.start(name)
-    yield lambda: flight.said(f"lockstep: {name} is back") > back
+    yield lambda: flight.said(f"lockstep: {name} has reconnected") > back
 
 
 def test_in_lockstep_they_take_their_places_and_it_perches(tmp_path):
@@ -77,10 +77,10 @@ def test_a_node_that_was_dropped_as_it_hung_comes_back_and_answers_to_its_goal(t
             flight.signal("mission", signal.SIGSTOP)
             yield lambda: flight.said("lockstep: mission is silent for .*: dropped") > 0
             flight.signal("mission", signal.SIGCONT)
-            yield lambda: flight.said("lockstep: mission is back") > 0
+            yield lambda: flight.said("lockstep: mission has reconnected") > 0
 
         result = flight.fly(acts())
-        assert flight.said("lockstep: mission is back") and getattr(result, "message", ""), result
+        assert flight.said("lockstep: mission has reconnected") and getattr(result, "message", ""), result
 
 
 def test_in_real_time_every_flight_ends_safely_and_the_next_begins(tmp_path):

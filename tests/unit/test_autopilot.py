@@ -52,7 +52,7 @@ def test_frames_are_found_in_whatever_pieces_and_between_noise(payloads, noise, 
         size = cuts[at % len(cuts)]
         found += parser.feed(stream[at:at + size])
         at += size
-    assert [(frame.command, frame.payload) for frame in found] == payloads and parser.torn == 0
+    assert [(frame.command, frame.payload) for frame in found] == payloads and parser.checksum_errors == 0
 
 
 def test_a_torn_frame_is_counted_and_the_next_one_is_found():
@@ -61,7 +61,7 @@ def test_a_torn_frame_is_counted_and_the_next_one_is_found():
     torn[7] ^= 0x40
     parser = msp.Parser()
     found = parser.feed(bytes(torn) + whole)
-    assert [frame.command for frame in found] == [msp.ANALOG] and parser.torn == 1
+    assert [frame.command for frame in found] == [msp.ANALOG] and parser.checksum_errors == 1
 
 
 @given(st.binary(max_size=300))
@@ -142,11 +142,11 @@ def test_the_throttle_follows_the_battery(thrust, voltage, exponent):
     battery = Battery(reference=16.0, exponent=exponent, range=(13.6, 16.8))
     sticks = Sticks(replace(VEHICLE, actuation=replace(VEHICLE.actuation, battery=battery)), (RateCurve(400, 900, 0),) * 3)
     full = sticks.throttle(thrust)
-    sticks.measured(voltage)
+    sticks.set_voltage(voltage)
     share = (min(max(voltage, 13.6), 16.8) / 16.0) ** exponent  # of the thrust at the same throttle
     throttle = sticks.throttle(thrust * share)
     assert 0.0 < throttle < 1.0 and throttle == pytest.approx(full)
-    assert sticks.fits(voltage) == (13.6 <= voltage <= 16.8)
+    assert sticks.covers_voltage(voltage) == (13.6 <= voltage <= 16.8)
 
 
 class StubAutopilot:
@@ -180,7 +180,7 @@ class StubAutopilot:
         self.mode = ["following"]
         self.told.append((armed, sticks))
 
-    def turning(self) -> None:
+    def report_motors_turning(self) -> None:
         self.told.append("turning")
 
     def set_throttles(self, hover: int, descent: int) -> None:
@@ -263,7 +263,7 @@ def test_a_process_that_holds_the_link_and_ends_is_replaced(armed, thrust, flown
     assert polled(node, 1.0, 50, thrust) == []
     last, opened = node._link, StubAutopilot.opened
     last.ended = True
-    assert polled(node, 1.5, 10) == ["the process that holds the link has ended: another one is started"]
+    assert polled(node, 1.5, 10) == ["the process that holds the link has ended: it is restarted"]
     assert StubAutopilot.opened == opened + 1 and last.closed and not node._link.closed
     command = (True, node._sticks.channels((0.0, 0.0, 0.0), thrust))
     assert node._link.told == ([] if not armed else ["turning", command] if thrust else [command])
@@ -288,7 +288,7 @@ def test_torn_frames_in_flight_are_one_line_and_the_whole_ones_count(flown_on):
     node.imu.receivers.append(samples.append)
     assert polled(node, 1.0, 100) == []
     node._link._said += whole[:-1] + bytes((whole[-1] ^ 0x55,))
-    assert polled(node, 2.0, 150) == ["/dev/ttyACM0: torn frames come from the autopilot: check the link and its baud rate"]
+    assert polled(node, 2.0, 150) == ["/dev/ttyACM0: corrupt frames received from the autopilot: check the link and its baud rate"]
     assert len(samples) > 240
     assert polled(node, 3.5, 150) == []
 
@@ -315,7 +315,7 @@ def test_a_serial_line_that_answers_at_another_rate_is_refused_and_motors_stay_o
 
     monkeypatch.setattr("perch_autopilot.betaflight.SupervisedLink", Noisy)
     monkeypatch.setattr("perch_autopilot.betaflight._HANDSHAKE", 0.1)
-    words = "bytes came that are no MSP: is the baud rate right" if noise else "no autopilot answers within 0.1 s$"
+    words = "bytes received that are not MSP: is the baud rate right" if noise else "no autopilot answers within 0.1 s$"
     with pytest.raises(msp.MspError, match=words) as error:
         Betaflight(BetaflightParameters(link=f"{os.ttyname(theirs)}@9600"))
     assert "\n" not in str(error.value) and links[0].process.wait(60.0) == 0
@@ -365,10 +365,10 @@ def test_it_arms_with_the_throttle_down():
 
 def test_of_what_flies_already_the_throttle_does_not_come_down():
     dog = Watchdog(hover=1450, descent=1420)
-    dog.turning()
-    assert not dog.begun
+    dog.report_motors_turning()
+    assert not dog.command_received
     dog.command(5.0, True, STICKS)
-    assert dog.begun and dog.channels(5.0) == (*STICKS, ON, OFF)
+    assert dog.command_received and dog.channels(5.0) == (*STICKS, ON, OFF)
     dog.command(5.1, False, STICKS)
     dog.command(5.2, True, STICKS)
     assert dog.channels(5.2) == (1500, 1500, 1000, 1500, ON, OFF)
@@ -376,7 +376,7 @@ def test_of_what_flies_already_the_throttle_does_not_come_down():
 
 def test_what_was_armed_before_the_first_command_is_taken_to_fly():
     dog = Watchdog(hover=1450, descent=1420)
-    dog.turning()
+    dog.report_motors_turning()
     dog.command(5.0, True, CENTRED)
     assert dog.channels(5.1)[2] == 1450
 
@@ -470,7 +470,7 @@ def test_far_from_level_rates_are_commanded_while_the_attitude_is_fresh_and_self
     dog = Watchdog(hover=1450, descent=1420, curves=CURVES)
     dog.command(-1.0, True, STICKS)
     dog.command(10.0, True, STICKS)
-    assert [dog.levels(10.0 + age) for age in (0.01, 0.03, 1.0)] == [False, True, True]
+    assert [dog.needs_attitude(10.0 + age) for age in (0.01, 0.03, 1.0)] == [False, True, True]
     for age, throttle in ((0.05, 1450), (0.6, 1420)):
         dog.attitude(10.0 + age, 0.0, np.radians(-80.0))                          # nose down: up again
         roll, pitch, *rest = dog.channels(10.0 + age)
@@ -481,7 +481,7 @@ def test_far_from_level_rates_are_commanded_while_the_attitude_is_fresh_and_self
     dog.attitude(14.1, 0.0, 1.5)
     assert dog.channels(14.1)[4] == OFF
     dog.command(15.0, False, STICKS)
-    assert not dog.levels(16.0)
+    assert not dog.needs_attitude(16.0)
 
 
 # -- configuration ---------------------------------------------------------------------------------------------------
@@ -503,7 +503,7 @@ def test_a_configuration_that_is_none_is_refused(tmp_path, text, words):
             load_configuration(str(tmp_path / name))
 
 
-@pytest.mark.parametrize("came, words", [(b"", "within 0 s$"), (b"\x00\xf8" * 40, "bytes came, at last .*: is the baud rate right")])
+@pytest.mark.parametrize("came, words", [(b"", "within 0 s$"), (b"\x00\xf8" * 40, "bytes received, the last .*: is the baud rate right")])
 def test_a_command_line_that_does_not_answer_is_one_line(came, words, monkeypatch):
     monkeypatch.setattr("perch_autopilot.configuration._ANSWER_TIME", 0.0)
     with pytest.raises(CliError, match=words) as error:
@@ -519,7 +519,7 @@ def test_rates_of_another_type_are_refused():
 
 
 @pytest.mark.parametrize("key, value, words", [
-    ("roll_rc_rate", "abc", "abc is no number"), ("roll_rc_rate", "nan", "nan is outside"), ("pitch_rc_rate", "0", "0 is outside"),
+    ("roll_rc_rate", "abc", "abc is not a number"), ("roll_rc_rate", "nan", "nan is outside"), ("pitch_rc_rate", "0", "0 is outside"),
     ("yaw_rc_rate", "-7", "-7 is outside"), ("roll_srate", "39", r"39 is outside \[40, 199.8\]"), ("yaw_srate", "inf", "inf is outside"),
     ("pitch_expo", "500", r"500 is outside \[0, 100\]"), ("yaw_expo", "-1", "-1 is outside")])
 def test_rates_that_the_firmware_cannot_have_are_refused_by_file_and_key(key, value, words):

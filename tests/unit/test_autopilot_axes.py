@@ -111,7 +111,7 @@ def test_rates_go_out_as_frd(node, w, thrust):
 def test_samples_come_in_as_flu(node, f, w):
     node._clock.offset, got = 0, []
     node.imu.receivers[:] = [got.append]
-    node._take(SimpleNamespace(get_type=lambda: "HIGHRES_IMU", get_srcSystem=lambda: 1, time_usec=1000, xacc=f[0], yacc=f[1], zacc=f[2],
+    node._handle_message(SimpleNamespace(get_type=lambda: "HIGHRES_IMU", get_srcSystem=lambda: 1, time_usec=1000, xacc=f[0], yacc=f[1], zacc=f[2],
                                xgyro=w[0], ygyro=w[1], zgyro=w[2]), NANOSECONDS)
     sample, = got
     assert sample.f_B == pytest.approx(FRD.inv().apply(f), abs=1e-9) and sample.w_B == pytest.approx(FRD.inv().apply(w), abs=1e-9)

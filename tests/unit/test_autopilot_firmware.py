@@ -33,7 +33,7 @@ from perch_sim.scenario import load_scenario
 from scipy.spatial.transform import Rotation
 
 try:
-    firmware.found()
+    firmware.find_program()
 except firmware.FirmwareError as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
@@ -163,7 +163,7 @@ def test_its_time_is_that_of_the_packets_and_no_pause_counts():
         for _ in range(500):
             running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
         time.sleep(2.5)  # more than seconds, which are cut, and the tolerance hide
-        uptime = re.search(r"System Uptime: (\d+) seconds", command_line(running).ask("status"))
+        uptime = re.search(r"System Uptime: (\d+) seconds", command_line(running).query("status"))
         assert int(uptime[1]) == pytest.approx(60.0 + running.time, abs=1.0)  # it begins with 60
     finally:
         running.close()
@@ -175,7 +175,7 @@ def test_a_firmware_that_freezes_is_named(tmp_path, monkeypatch):
     try:
         running._running.received.settimeout(0.05)
         running._running.process.send_signal(signal.SIGSTOP)
-        with pytest.raises(sitl.Frozen, match="has not answered"):
+        with pytest.raises(sitl.FirmwareTimeoutError, match="has not answered"):
             for _ in range(100):  # what it had begun it may answer
                 running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
     finally:
@@ -187,7 +187,7 @@ def test_a_firmware_that_freezes_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(firmware, "found", lambda: program)
     monkeypatch.setattr(sitl, "_START", 0.1)
     monkeypatch.setattr(sitl, "IsolatedProgram", lambda *words: launched.append(IsolatedProgram(*words)) or launched[-1])
-    with pytest.raises(sitl.Frozen, match="does not open its port"):
+    with pytest.raises(sitl.FirmwareTimeoutError, match="does not open its port"):
         Sitl(loaded)
     assert [one.process.poll() is not None for one in launched] == [True]
 
@@ -307,7 +307,7 @@ def test_what_flies_goes_on_when_node_or_supervisor_are_started_anew(vehicle):
         flown(1.0)                                                                # its state is known
         node._link.process.kill()
         assert flown(1.5) > 0.6
-        assert "the process that holds the link has ended: another one is started" in {line.text for line in got["log"]}
+        assert "the process that holds the link has ended: it is restarted" in {line.text for line in got["log"]}
         node._link.process.kill()                                                 # and the node with it
         nodes.append(component(vehicle)[0])
         assert flown(1.5) > 0.6
@@ -434,7 +434,7 @@ def test_an_autopilot_that_does_not_answer_is_refused():
     import socket
     ours, theirs = socket.socketpair()
     theirs.send(b"\x00\xff\x13garbage")
-    with pytest.raises(msp.MspError, match="no autopilot answers .* bytes came that are no MSP: is the baud rate right"):
+    with pytest.raises(msp.MspError, match="no autopilot answers .* bytes received that are not MSP: is the baud rate right"):
         Betaflight(BetaflightParameters(link=f"fd:{ours.fileno()}"))
     ours.close()
     theirs.close()

@@ -62,7 +62,7 @@ def test_a_full_port_gets_whole_frames_or_none():
     parser = msp.Parser()
     frames = parser.feed(got.replace(b"$M<", b"$M>"))
     numbers = [struct.unpack_from("<I", frame.payload)[0] for frame in frames if frame.command == msp.SET_RAW_RC]
-    assert parser.torn == parser.skipped == 0 and frames[-1].command == msp.STATUS
+    assert parser.checksum_errors == parser.skipped == 0 and frames[-1].command == msp.STATUS
     assert 100 < len(numbers) < 5000 and numbers == sorted(set(numbers))
     link.close()
     os.close(theirs)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from perch_autopilot.link import Link, LinkError
 from perch_autopilot.mavlink import ClockOffset, Mavlink, MavlinkParameters
-from perch_autopilot.offboard import ARDUPILOT, ARMED, GUIDED_NOGPS, OFFBOARD, PX4, Ask, Offboard
+from perch_autopilot.offboard import ARDUPILOT, ARMED, GUIDED_NOGPS, OFFBOARD, PX4, Offboard, Request
 from perch_core.component import Output, ports
 from perch_core.values import NANOSECONDS, OdometryState, RatesThrust
 from perch_core.vehicle import load_vehicle
@@ -17,14 +17,14 @@ from perch_core.vehicle import load_vehicle
 SECOND = NANOSECONDS
 
 
-def asked(machine: Offboard, seconds: float, start: float = 0.0, wanted: bool = True, streaming: bool = True) -> list[Ask]:
+def asked(machine: Offboard, seconds: float, start: float = 0.0, wanted: bool = True, streaming: bool = True) -> list[Request]:
     """What a machine asks for in some time, at 100 Hz, but for nothing; the autopilot's heartbeats go on."""
     out = []
     for k in range(round(100 * seconds)):
         now = start + 0.01 * k
         machine.heartbeat(now, machine.autopilot, ARMED * machine.armed, machine.mode if machine.following else 0)
-        out.append(machine.ask(now, wanted, streaming))
-    return [ask for ask in out if ask is not Ask.NOTHING]
+        out.append(machine.next_request(now, wanted, streaming))
+    return [request for request in out if request is not Request.NOTHING]
 
 
 @pytest.mark.parametrize("autopilot, mode", [(PX4, OFFBOARD), (ARDUPILOT, GUIDED_NOGPS)])
@@ -32,12 +32,12 @@ def test_set_points_come_first_then_the_mode_then_the_motors(autopilot, mode):
     machine = Offboard(autopilot=autopilot)
     assert machine.mode == mode
     assert asked(machine, 0.4) == []                           # set points have to flow first
-    assert asked(machine, 1.0, start=0.4) == [Ask.MODE]
+    assert asked(machine, 1.0, start=0.4) == [Request.MODE]
     machine.following = True
-    assert asked(machine, 1.0, start=1.5) == [Ask.ARM]
+    assert asked(machine, 1.0, start=1.5) == [Request.ARM]
     machine.armed = True
     assert asked(machine, 1.0, start=2.5) == []
-    assert asked(machine, 1.0, start=3.5, wanted=False) == [Ask.DISARM]
+    assert asked(machine, 1.0, start=3.5, wanted=False) == [Request.DISARM]
 
 
 def test_a_pilot_who_takes_the_mode_back_keeps_it():
@@ -47,19 +47,19 @@ def test_a_pilot_who_takes_the_mode_back_keeps_it():
     assert asked(machine, 5.0, start=2.0) == []
     machine.armed = False
     assert asked(machine, 1.0, start=7.0, wanted=False) == []
-    assert Ask.MODE in asked(machine, 2.0, start=8.0)
+    assert Request.MODE in asked(machine, 2.0, start=8.0)
 
 
 def test_what_flies_already_is_asked_for_nothing():
     """A node that is started anew in flight: neither the pilot's mode, nor a vehicle that follows without set points, is its to change."""
     assert asked(Offboard(autopilot=PX4, armed=True), 5.0) == []
     following = Offboard(autopilot=PX4, armed=True, following=True)
-    assert asked(following, 5.0, wanted=False, streaming=False) == [] and Ask.DISARM in asked(following, 1.0, start=5.0, wanted=False)
+    assert asked(following, 5.0, wanted=False, streaming=False) == [] and Request.DISARM in asked(following, 1.0, start=5.0, wanted=False)
 
 
 def test_nothing_is_asked_of_an_autopilot_that_is_gone_or_without_set_points():
     machine = Offboard()
-    assert [machine.ask(0.01 * k, True, True) for k in range(300)] == [Ask.NOTHING] * 300
+    assert [machine.next_request(0.01 * k, True, True) for k in range(300)] == [Request.NOTHING] * 300
     assert asked(Offboard(autopilot=PX4), 3.0, streaming=False) == []
 
 
@@ -380,4 +380,4 @@ def test_any_bytes_leave_the_node_ready(autopilot):
     assert autopilot.node.offboard.armed
     autopilot.heard(1.1)
     assert autopilot.got["diagnostics"][-1].values["torn_frames"] > 0
-    assert "torn frames come from the autopilot: check the link and its baud rate" in {line.text for line in autopilot.got["log"]}
+    assert "corrupt frames received from the autopilot: check the link and its baud rate" in {line.text for line in autopilot.got["log"]}

@@ -144,8 +144,8 @@ def torn(frame: bytes) -> bytes:
     ({"answers": {msp.FC_VERSION: bytes((26, 6, 0))}}, "the autopilot runs BTFL 26.6.0, not Betaflight (BTFL) 4.3 to 4.6"),
     ({"answers": {msp.FC_VARIANT: b"INAV"}}, "the autopilot runs INAV 4.6.0"),
     ({"answers": {}}, "no autopilot answers within 2 s"),
-    ({"answers": {}, "noise": b"\x00\xf8\x06\x9e" * 9}, "bytes came that are no MSP: is the baud rate right"),
-    ({"spoil": torn}, "bytes came that are no MSP: is the baud rate right"),
+    ({"answers": {}, "noise": b"\x00\xf8\x06\x9e" * 9}, "bytes received that are not MSP: is the baud rate right"),
+    ({"spoil": torn}, "bytes received that are not MSP: is the baud rate right"),
     ({"answers": {msp.STATUS: status(1 << 23)}}, "the autopilot refuses to arm: accelerometer is not calibrated: calibrate it"),
     ({"answers": {msp.ANALOG: analog(12.1)}}, "the battery has 12.1 V: the thrust curve of"),
 ], ids=["another version", "another firmware", "silence", "another baud rate", "torn frames only", "a lasting refusal", "another battery"])
@@ -173,7 +173,7 @@ def test_a_fault_after_the_start_does_not_end_the_node(armed, peer, tmp_path):
         peer.spoil, peer.noise = (torn, b"\x00\xf8\x06\x9e" * 3) if not fault else (peer.spoil, b"")
         begin = len(peer.heard)
         until(lambda: peer.heard.count(msp.request(msp.RAW_IMU), begin) > 150, process)  # noqa: B023  called at once
-    goes_on(process, "12.1 V", "torn frames come from the autopilot")
+    goes_on(process, "12.1 V", "corrupt frames received from the autopilot")
     assert peer.switches == set()
 
 
@@ -202,8 +202,8 @@ def heartbeat(autopilot: int) -> bytes:
 
 @pytest.mark.parametrize("noise, words", [
     (lambda: b"", "no heartbeat of the autopilot: check its power, link and system id"),
-    (lambda: b"\x00\xf8\x06\x9e" * 9, "torn frames: is the baud rate right?"),
-    (lambda: torn(heartbeat(12)), "torn frames: is the baud rate right?"),
+    (lambda: b"\x00\xf8\x06\x9e" * 9, "corrupt frames: is the baud rate right?"),
+    (lambda: torn(heartbeat(12)), "corrupt frames: is the baud rate right?"),
     (lambda: heartbeat(8), "the autopilot is of MAVLink's type 8, not PX4 (12) or ArduPilot (3)"),
 ], ids=["silence", "another baud rate", "torn frames only", "another autopilot"])
 def test_a_mavlink_autopilot_that_is_none_is_one_line_and_exit_code_2(noise, words, peer):
@@ -237,7 +237,7 @@ class Bench:
     def __init__(self, *more: str) -> None:
         loaded = load_configuration("betaflight")
         try:
-            firmware.found()
+            firmware.find_program()
         except firmware.FirmwareError as missing:
             pytest.skip(str(missing))
         try:

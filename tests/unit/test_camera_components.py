@@ -10,7 +10,7 @@ from perch_core.errors import ConfigError
 from perch_core.so3 import quat_from_matrix
 from perch_core.values import CameraImage, CameraModel, OdometryState, Transform
 from perch_core.vehicle import load_vehicle
-from perch_perception.camera_component import MOST_WAITING
+from perch_perception.camera_component import MAX_QUEUED
 from perch_perception.powerline_mapper import PowerlineMapper, PowerlineMapperConfig
 from perch_perception.tags import Localization
 from perch_perception.tags.pose import BoardPose
@@ -123,12 +123,12 @@ def test_the_average_of_an_image_is_taken_once_it_is_good():
 
 def test_the_queue_is_bounded():
     bench = Bench()
-    for k in range(MOST_WAITING + 5):
+    for k in range(MAX_QUEUED + 5):
         bench.image(100 + 10 * k)
     assert bench.component.dropped == 5
     assert any("dropped" in text for text in bench.out.warnings())
     bench.odometry(0, 400)
-    assert len(bench.exposures) == MOST_WAITING and bench.exposures[0] == 150 + EXPOSED // MS
+    assert len(bench.exposures) == MAX_QUEUED and bench.exposures[0] == 150 + EXPOSED // MS
 
 
 @pytest.mark.parametrize("bad", [
@@ -158,7 +158,7 @@ def test_odometry_that_was_started_again_is_followed(jump):
     bench.image(5990)
     assert len(bench.exposures) == 2
     bench.odometry(6002 + jump, 6200 + jump)
-    assert any("starting anew" in text for text in bench.out.warnings())
+    assert any("restarting" in text for text in bench.out.warnings())
     bench.image(6100 + jump)
     assert bench.exposures[-1] == 6100 + jump + EXPOSED // MS
 
@@ -256,7 +256,7 @@ def test_the_mapper_takes_so_many_images_a_second():
 
 
 @pytest.mark.parametrize(("odometries", "encoding", "why"), [
-    (dict(pose_covariance=np.eye(6) * 9.0), "rgb8", "nothing is mapped"), ({}, "mono8", "no colour"), ({}, "16UC1", "encoding")])
+    (dict(pose_covariance=np.eye(6) * 9.0), "rgb8", "mapping paused"), ({}, "mono8", "no colour"), ({}, "16UC1", "encoding")])
 def test_the_mapper_says_why_an_image_was_not_used(odometries, encoding, why):
     component, out, mount = mapper()
     for ms in range(0, 200, 2):

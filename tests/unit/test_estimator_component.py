@@ -177,7 +177,7 @@ def test_a_source_that_was_started_again_is_heard_again(jump):
     hover.next_vio = hover.now + 100 * MS
     hover.fly(0.5)
     assert hover.last.stamp == hover.now
-    assert any("starting anew" in text for text in hover.out.warnings())
+    assert any("restarting" in text for text in hover.out.warnings())
     hover.assert_running()
 
 

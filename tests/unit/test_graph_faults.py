@@ -53,7 +53,7 @@ def test_ends(situation, end):
 def test_a_node_is_no_witness_of_itself_and_routine_names_nobody():
     lines = ["[ERROR] [1000000101.0] [estimator]: odometry lost", "[INFO] [1000000101.0] [mission]: odometry is good",
              "[INFO] [1000000102.5] [controller]: descent without position: no odometry",
-             "[ERROR] [1000000090.0] [vehicle]: lockstep: estimator is gone", "Traceback: estimator"]
+             "[ERROR] [1000000090.0] [vehicle]: lockstep: estimator has disconnected", "Traceback: estimator"]
     assert first_report(CASE, 1000000100.0, lines, []) == (2.5, "controller: descent without position: no odometry")
     assert first_report(CASE, 1000000100.0, lines[:2], [(1000000101.0, "waits for the estimator")]) is None
     assert first_report(CASE, 1000000100.0, lines, [(1000000101.5, "/estimator has sent no diagnostics for 3 s")])[0] == 1.5

@@ -256,7 +256,7 @@ def test_nothing_is_mapped_from_a_pose_that_is_hardly_known():
     for time, sigma in ((1.0, 0.1), (1.02, 0.1), (1.04, 3.0), (1.06, 3.0)):
         poses.add(BodyState(time, np.array([time, 0.0, 2.0]), level, np.zeros(3), np.zeros(3), np.eye(6) * sigma**2))
     assert mapping_pose(poses, 1.01, 2.0).p_WB[0] == pytest.approx(1.01)
-    with pytest.raises(StampError, match="known to 3.00 m only"):
+    with pytest.raises(StampError, match="position uncertainty 3.00 m exceeds"):
         mapping_pose(poses, 1.05, 2.0)
     with pytest.raises(StampError, match="older"):
         mapping_pose(poses, 0.5, 2.0)

@@ -7,7 +7,7 @@ from perch_core import so3
 from perch_core.camera import EquidistantCamera, PinholeCamera
 from perch_core.catenary import Catenary
 from perch_core.vehicle import load_vehicle
-from perch_perception.line_mapping import Backdrop, LineDetectionConfig, LineMapper, MapperConfig, detect_lines, place
+from perch_perception.line_mapping import BackgroundCheck, LineDetectionConfig, LineMapper, MapperConfig, detect_lines, place
 from perch_perception.line_mapping.ridges import ridges
 from perch_perception.pose_buffer import BodyState
 from perch_sim.rendering import CableCurve, Renderer, Scene
@@ -120,7 +120,7 @@ def flight(renderer, mapper, backdrop, steps=14):
     rng, said = np.random.default_rng(0), []
 
     def attached(one, curve):
-        said.append(backdrop.attached(one, curve))
+        said.append(backdrop.is_on_surface(one, curve))
         return said[-1]
 
     for k, share in enumerate(np.linspace(0.0, 1.0, steps)):
@@ -128,7 +128,7 @@ def flight(renderer, mapper, backdrop, steps=14):
         body = BodyState(0.1 * k, p, so3.quat_from_matrix(R @ so3.exp(5e-4 * rng.standard_normal(3))), np.zeros(3),
                          np.zeros(3), np.diag([2.5e-5] * 3 + [1e-5] * 3))
         image = cv2.cvtColor(renderer.render([(p, R)], rng), cv2.COLOR_RGB2GRAY)
-        backdrop.look(image, body.time, *MOUNT.pose(body.p_WB, body.R_WB))
+        backdrop.add_image(image, body.time, *MOUNT.pose(body.p_WB, body.R_WB))
         result = mapper.update(0.1 * k, body, [place(one, body, MOUNT) for one in detect_lines(image, MOUNT.camera, PLAIN)], attached)
     return result, said
 
@@ -136,7 +136,7 @@ def flight(renderer, mapper, backdrop, steps=14):
 def test_maps_grey_wires_within_three_centimetres_and_sees_that_they_hang_free():
     cables = [Catenary.from_sag(np.array([3.0, -4.0, 2.6]), np.array([3.0, 4.0, 2.8]), 0.1),
               Catenary.from_sag(np.array([3.6, -4.0, 2.1]), np.array([3.2, 4.0, 2.0]), 0.1)]
-    result, said = flight(Renderer(scene(cables), MOUNT, seed=1), LineMapper(MapperConfig()), Backdrop(MOUNT.camera))
+    result, said = flight(Renderer(scene(cables), MOUNT, seed=1), LineMapper(MapperConfig()), BackgroundCheck(MOUNT.camera))
     assert len({line.segment.id % 100 for line in result.lines}) == 2
     for cable in cables:
         points = cable.sample(200)
@@ -148,7 +148,7 @@ def test_maps_grey_wires_within_three_centimetres_and_sees_that_they_hang_free()
 
 def test_a_line_on_the_wall_is_seen_to_move_with_it_and_is_not_mapped():
     seam = Catenary.from_sag(np.array([3.99, -4.4, 2.6]), np.array([3.99, 4.4, 2.4]), 0.001)
-    result, said = flight(Renderer(scene([seam], wall=4.0), MOUNT, seed=1), LineMapper(MapperConfig()), Backdrop(MOUNT.camera))
+    result, said = flight(Renderer(scene([seam], wall=4.0), MOUNT, seed=1), LineMapper(MapperConfig()), BackgroundCheck(MOUNT.camera))
     assert said.count(True) >= 3 and said.count(False) == 0
     assert result.lines == ()
 

@@ -74,10 +74,10 @@ def test_an_image_that_is_drawn_later_is_handed_to_neighbours_once_it_is_drawn(e
     vehicle = created(executor, VehicleNode, SimulatedVehicle, wiring, cameras="none")
     image = CameraImage(1, "camera", 1, 1, "mono8", lambda _: np.zeros((1, 1), np.uint8), lambda timeout: bool(drawn))
     vehicle.component.image_down(image)
-    vehicle._publish_drawn()
+    vehicle._publish_rendered()
     assert not seen
     drawn.append(True)
-    vehicle._publish_drawn()
+    vehicle._publish_rendered()
     assert seen == [image]
 
 

@@ -119,7 +119,7 @@ def test_a_flight_that_begins_anew_is_answered_anew():
     fly(vio, 0.5)
     before = len(states)
     fly(vio, 0.5)
-    assert len(states) == 2 * before and any("begun anew" in line.text for line in log)
+    assert len(states) == 2 * before and any("estimator reset" in line.text for line in log)
 
 
 def test_a_camera_that_there_is_not_is_refused(monkeypatch):

@@ -14,7 +14,7 @@ from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.preflight import checks, command
 from perch_eval.camera_turns import CameraTurns
 from perch_eval.preflight.ros import listener
-from perch_sim.drawing import DrawnOnDemand
+from perch_sim.drawing import OnDemandRendering
 from perch_sim.parameters import VehicleParameters
 from perch_sim.scenario import load_scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
@@ -43,7 +43,7 @@ def rates_B(t: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def seen() -> Seen:
     scenario = replace(load_scenario("surface_90"), vehicle="rpg")
-    vehicle = SimulatedVehicle(VehicleParameters(seed=3, cameras="none"), scenario, DrawnOnDemand)
+    vehicle = SimulatedVehicle(VehicleParameters(seed=3, cameras="none"), scenario, OnDemandRendering)
     imu: list = []
     odometry: list = []
     vehicle.imu.receivers.append(imu.append)

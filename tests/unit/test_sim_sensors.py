@@ -90,7 +90,7 @@ def test_history_interpolates_a_turning_climb():
         np.testing.assert_allclose(found.p_WB, p, atol=1e-12)
         assert abs(abs(found.q_WB @ q) - 1) < 1e-12
     times = (1_234_567, 4_000_000, 17_000_001)
-    p_WB, q_WB = between([history.around(ns) for ns in times])  # an image must not depend on which of the two was asked
+    p_WB, q_WB = between([history.bracket(ns) for ns in times])  # an image must not depend on which of the two was asked
     np.testing.assert_array_equal(p_WB, [history.at(ns).p_WB for ns in times])
     np.testing.assert_array_equal(q_WB, [history.at(ns).q_WB for ns in times])
     with pytest.raises(LookupError, match="outside"):

@@ -16,7 +16,7 @@ from perch_core.values import NANOSECONDS
 from perch_core.vehicle import load_vehicle
 from perch_sim import seeding
 from perch_sim.body import make_body
-from perch_sim.drawing import Drawing, DrawnInProcesses, DrawnOnDemand
+from perch_sim.drawing import Rendering, ProcessRendering, OnDemandRendering
 from perch_sim.plant import resting_state
 from perch_sim.scenario import Wind, load_scenario
 from perch_sim.simulation import Simulation
@@ -38,7 +38,7 @@ def climb(flight: Simulation) -> np.ndarray:
 def fly(seconds: float, seed: int, render: tuple[str, ...] = (), late: bool = False) -> tuple[str, list[bytes], Simulation]:
     """Digest of all states and samples, and all images, looked at as they arrive or in the end from last to first."""
     flown, deliveries, seen = hashlib.sha256(), [], {}
-    flight = Simulation(SCENARIO, seed, DrawnOnDemand(SCENARIO, seed, render))
+    flight = Simulation(SCENARIO, seed, OnDemandRendering(SCENARIO, seed, render))
     while flight.time < (1 + seconds) * NANOSECONDS:
         flight.motors.command(flight.time, True, climb(flight))
         output = flight.advance()
@@ -119,13 +119,13 @@ def test_vio_stand_in_has_its_documented_drift_and_noise():
 
 
 def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_only():
-    drawing = DrawnInProcesses(SCENARIO, 3, ("front",))
+    drawing = ProcessRendering(SCENARIO, 3, ("front",))
     try:
         assert eventually(drawing.ready)
-        assert images(drawing) == images(DrawnOnDemand(SCENARIO, 3, ("front",)))
-        os.kill(drawing._draftsmen["front"].process.pid, signal.SIGINT)  # Ctrl-C in the terminal is the vehicle's matter
+        assert images(drawing) == images(OnDemandRendering(SCENARIO, 3, ("front",)))
+        os.kill(drawing._clients["front"].process.pid, signal.SIGINT)  # Ctrl-C in the terminal is the vehicle's matter
         assert len(images(drawing, 1)) == 1
-        os.kill(drawing._draftsmen["front"].process.pid, signal.SIGKILL)
+        os.kill(drawing._clients["front"].process.pid, signal.SIGKILL)
         flight = Simulation(SCENARIO, 3, drawing)
         camera, frames = flight.cameras["front"], 0
         while frames < 2:
@@ -141,9 +141,9 @@ def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_onl
 
 
 def test_a_process_that_ends_before_it_has_drawn_anything_holds_nobody_up():
-    drawing = DrawnInProcesses(SCENARIO, 3, ("front",))
+    drawing = ProcessRendering(SCENARIO, 3, ("front",))
     try:
-        os.kill(drawing._draftsmen["front"].process.pid, signal.SIGKILL)  # Python itself takes longer to start than this to come
+        os.kill(drawing._clients["front"].process.pid, signal.SIGKILL)  # Python itself takes longer to start than this to come
         assert eventually(drawing.ready)
     finally:
         drawing.close()
@@ -157,7 +157,7 @@ def eventually(condition: Callable[[], bool]) -> bool:
     return condition()
 
 
-def images(drawing: Drawing, count: int = 3) -> list[bytes]:
+def images(drawing: Rendering, count: int = 3) -> list[bytes]:
     """The first images of a vehicle on the floor."""
     flight, out = Simulation(SCENARIO, 3, drawing), []
     while len(out) < count:
@@ -183,7 +183,7 @@ class Stuck:
 def test_a_slow_machine_gives_up_images_in_real_time_and_none_in_lockstep(limit, given_up):
     flight = Simulation(load_scenario("surface_90"), seed=1, drawing=Stuck())
     camera = flight.cameras["front"]
-    camera.most_waiting = limit
+    camera.max_pending_images = limit
     while flight.time < NANOSECONDS + 5 * NANOSECONDS // 30:  # five exposures
         flight.advance()
     assert camera.dropped == given_up

@@ -12,7 +12,7 @@ from perch_core import config
 from perch_core.errors import ConfigError
 from perch_core.values import MotorCommand
 from perch_sim.contact_event import ContactState
-from perch_sim.drawing import DrawnInProcesses, DrawnOnDemand
+from perch_sim.drawing import ProcessRendering, OnDemandRendering
 from perch_sim.lockstep import Schedule, flight_tasks
 from perch_sim.parameters import VehicleParameters
 from perch_sim.scenario import load_scenario
@@ -22,7 +22,7 @@ MS = 1_000_000
 SCENARIO = load_scenario("surface_90")
 
 
-def vehicle(cameras: str = "none", scenario=SCENARIO, drawing=DrawnOnDemand, seed: int = 3) -> tuple[SimulatedVehicle, dict[str, list]]:
+def vehicle(cameras: str = "none", scenario=SCENARIO, drawing=OnDemandRendering, seed: int = 3) -> tuple[SimulatedVehicle, dict[str, list]]:
     """A vehicle, and what it emits by port."""
     made, seen = SimulatedVehicle(VehicleParameters(seed=seed, cameras=cameras), scenario, drawing), {}
     for port in ("imu", "truth", "target", "rotors", "contact", "clock", "frames", "info_down", "image_down", "info_front", "image_front",
@@ -126,23 +126,23 @@ def test_images_that_processes_draw_are_waited_for_and_a_camera_whose_process_en
     expected, on_demand = vehicle("front")
     for _ in range(60):
         expected.advance()
-    drawn, seen = vehicle("front", drawing=DrawnInProcesses)
+    drawn, seen = vehicle("front", drawing=ProcessRendering)
     try:
         schedule = Schedule(drawn, [], flight_tasks(SCENARIO.latency))
         while schedule.index < 60:
             if not schedule.advance():
-                assert schedule.owed()[0].name == "camera_front" and schedule.await_image(1.0)
+                assert schedule.pending()[0].name == "camera_front" and schedule.await_image(1.0)
         image = seen["image_front"][0]
         while not image.ready(1.0):
             pass
         assert np.array_equal(image.pixels(), on_demand["image_front"][0].pixels())
-        os.kill(drawn._drawing._draftsmen["front"].process.pid, signal.SIGKILL)
+        os.kill(drawn._drawing._clients["front"].process.pid, signal.SIGKILL)
         while schedule.index < 250:
             if not schedule.advance():
                 assert schedule.await_image(1.0)
         assert len(seen["info_front"]) > len(seen["image_front"]) + 2
         assert [line.text for line in seen["log"] if line.level == "error"] == [
-            "camera_front: the process that draws its images has ended: no images any more"]
+            "camera_front: the process that renders its images has ended: no more images"]
     finally:
         drawn.close()
 

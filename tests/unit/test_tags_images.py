@@ -107,7 +107,7 @@ def test_following_without_reading_the_numbers_is_as_accurate_and_notices_a_cove
     """Expected corners are measured at once; a hand over one tag is seen in the same image."""
     place = places("surface_90")
     followed, looked = BoardLocalizer(BOARD, MOUNT), BoardLocalizer(BOARD, MOUNT)
-    looked._follow = lambda *_: None
+    looked._track = lambda *_: None
     for k in range(8):
         p, R = np.array([0.03 * k, 0.02 * k, 1.2]), so3.exp(np.array([0.0, 0.02 * k, 0.01 * k]))
         image = place.image(p, R)

@@ -115,7 +115,7 @@ def test_a_grid_whose_tags_touch_black_squares(distance, least):
 
 
 def test_of_two_boards_alike_the_expected_one_is_followed_and_a_stray_tag_is_left_out(monkeypatch):
-    monkeypatch.setattr("perch_perception.tags.localizer.FOLLOW_IMAGES", 0)
+    monkeypatch.setattr("perch_perception.tags.localizer.MAX_TRACKED_IMAGES", 0)
     rng, board, alone = np.random.default_rng(4), pad(), TagBoard((0.2, 0.2), (Tag(2, (0.0, 0.0), 0.16),))
     here, there, R = np.array([-0.55, 0.0, 2.0]), np.array([0.5, 0.1, 2.0]), turned(10.0, 15.0, 0.0)
     localizer = BoardLocalizer(board, MOUNT)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_perception.ukf.stillness import still
+from perch_perception.ukf.stillness import is_at_rest
 from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioPose
 
 CONFIG, RATE, SIGMA = UkfConfig(), 100.0, (0.03, 0.01)
@@ -92,15 +92,15 @@ UP, KNOWN = np.array([0.0, 0.0, 9.81]), np.full(6, 1e-6)
 def test_flight_fall_and_turning_are_not_rest():
     t, axis = 0.002 * np.arange(100), np.array([0.0, 1.0, 0.0])
     shaken = 0.1 * np.sin(20.0 * t)[:, None] * axis
-    assert still(steps(0.0, UP)) and still(steps(0.004, -UP), np.r_[np.full(3, 0.004), np.zeros(3)], KNOWN)
+    assert is_at_rest(steps(0.0, UP)) and is_at_rest(steps(0.004, -UP), np.r_[np.full(3, 0.004), np.zeros(3)], KNOWN)
     for biases in ((), (np.zeros(6), KNOWN)):
-        assert not still(steps(0.0, 0.0 * UP), *biases)             # it falls
-        assert not still(steps(shaken, UP), *biases)                # held up by rotors
-        assert not still(steps(0.0, 1.2 * UP), *biases)             # it climbs
-        assert not still(steps(0.0, UP, n=50), *biases)             # too short to say
-        assert not still(steps(0.5 * axis, UP), *biases)            # it turns as no bias does
-    assert not still(steps(0.05 * axis, UP), np.zeros(6), KNOWN)    # it turns steadily
-    assert still(steps(0.05 * axis, UP), np.zeros(6), np.full(6, 0.05**2))  # as far as anybody knows, it rests
+        assert not is_at_rest(steps(0.0, 0.0 * UP), *biases)             # it falls
+        assert not is_at_rest(steps(shaken, UP), *biases)                # held up by rotors
+        assert not is_at_rest(steps(0.0, 1.2 * UP), *biases)             # it climbs
+        assert not is_at_rest(steps(0.0, UP, n=50), *biases)             # too short to say
+        assert not is_at_rest(steps(0.5 * axis, UP), *biases)            # it turns as no bias does
+    assert not is_at_rest(steps(0.05 * axis, UP), np.zeros(6), KNOWN)    # it turns steadily
+    assert is_at_rest(steps(0.05 * axis, UP), np.zeros(6), np.full(6, 0.05**2))  # as far as anybody knows, it rests
 
 
 @pytest.mark.parametrize("rate", [100.0, 200.0, 400.0, 1000.0])
@@ -111,8 +111,8 @@ def test_rest_is_in_the_variance_whatever_the_biases(rate, turn):
     for seed in range(20):
         b_g, b_a = (size * v / np.linalg.norm(v) for size, v in zip((0.2, 1.0), rng.normal(size=(2, 3))))
         rows = steps(b_g, R.T @ UP + b_a, rate, seed=seed)
-        seen += [still(rows), still(rows, np.r_[b_g, b_a], KNOWN)]
-        assert not still(rows, np.zeros(6), KNOWN)
+        seen += [is_at_rest(rows), is_at_rest(rows, np.r_[b_g, b_a], KNOWN)]
+        assert not is_at_rest(rows, np.zeros(6), KNOWN)
         rows[:, 1:4] += rng.normal(0.0, 0.05, (len(rows), 3))
-        assert not still(rows)
+        assert not is_at_rest(rows)
     assert all(seen)

@@ -84,7 +84,7 @@ def test_surface_faces_the_start():
 @pytest.mark.parametrize("change, words", [
     ({"target": {"distance": 0.0}}, "target.distance: 0 is outside [0.8, 3.5] m"),
     ({"target": {"distance": 3.4, "height": 3.5}}, "outside [0.8, 3.6] m that the camera reads"),
-    ({"world": {"room": [1.0, 2.0, 3.0]}}, "no place on the floor of the room"),
+    ({"world": {"room": [1.0, 2.0, 3.0]}}, "is not on the floor of the room"),
     ({"target": {"inclination_deg": 180.0, "height": 0.5}}, "below the search hover"),
     ({"nodes": ["vehicle", "pilot"]}, "'pilot' is not one of"),
     ({"parameters": {"pilot": {}}}, "parameters.pilot"),
@@ -94,8 +94,8 @@ def test_surface_faces_the_start():
     ({"world": {"cables": [{"start": [0.0, 0.0, 2.0], "end": [4.0, 0.0, 2.0], "sag": 1e3}]}}, "world.cables[0].sag: 1000 m is outside [0, 4] m"),
     ({"name": "../../x"}, "'../../x' is no name"), ({"vehicle": "../vehicles/rpg", "name": "a" * 101}, "is no name"),
     ({"start": {"position": [1e9, 0.0, 0.0]}}, "start.position: 1e+09 is outside [-10000, 10000] m"),
-    ({"start": {"position": [50.0, 0.0, 0.0]}}, "start.position: (50, 0, 0) m is no place on the floor of the room"),
-    ({"start": {"position": [0.0, 0.0, -0.5]}}, "start.position: (0, 0, -0.5) m is no place on the floor of the room"),
+    ({"start": {"position": [50.0, 0.0, 0.0]}}, "start.position: (50, 0, 0) m is not on the floor of the room"),
+    ({"start": {"position": [0.0, 0.0, -0.5]}}, "start.position: (0, 0, -0.5) m is not on the floor of the room"),
     ({"adhesion": {"normal_speed": [1.0, 0.2]}}, "adhesion.normal_speed: [1, 0.2] m/s is empty"),
     ({"inspection": {"watched": [math.nan, 0.0, 0.0]}}, "inspection.watched: nan is outside [-10000, 10000] m"),
 ])

@@ -154,7 +154,7 @@ def test_a_vehicle_that_was_started_again_is_followed(shift):
     again = Flight()
     again.component, again.out = flight.component, flight.out
     again.fly(2.5, shift=shift)
-    assert any("starting anew" in text for text in flight.out.warnings())
+    assert any("restarting" in text for text in flight.out.warnings())
     last = flight.out["state"][-1]
     assert last.stamp > shift and again.error(last, shift)[0] < 0.05
 

@@ -20,9 +20,9 @@ def standing(rng, height=STANDING):
     """A filter whose state is off by what its covariance says, and 80 features of the ground as the camera sees them."""
     p_WB = np.array([1.0, -2.0, FLOOR + height])
     points = np.column_stack([p_WB[:2] + rng.uniform(-0.35, 0.35, (80, 2)), FLOOR + rng.normal(0, ground.SIGMA, 80)])
-    known = start.told(p_WB, 0.3)
+    known = start.configured_pose(p_WB, 0.3)
     R_WB = so3.exp(np.array([0.0, 0.0, 0.3]))
-    state = start.fresh(CONFIG, MOUNT, 0, R_WB, known, np.zeros(3), np.zeros(3), 0.01, 0.005, 0.001)
+    state = start.initial_state(CONFIG, MOUNT, 0, R_WB, known, np.zeros(3), np.zeros(3), 0.01, 0.005, 0.001)
     X_C = ((points - p_WB) @ R_WB - MOUNT.p_BC) @ MOUNT.R_BC
     pixels, valid = MOUNT.camera.project(X_C)
     valid &= MOUNT.camera.contains(pixels, 8)
@@ -39,7 +39,7 @@ def test_points_of_the_ground_are_where_their_covariance_says():
     rng, squared = np.random.default_rng(1), []
     for _ in range(40):
         filter, points, ids, bearings = standing(rng)
-        count = ground.take_in(filter, ids, bearings, FLOOR)
+        count = ground.add_ground_landmarks(filter, ids, bearings, FLOOR)
         s = filter.state
         assert 10 <= count <= CONFIG.filter.landmarks and s.size == at.CORE_SIZE + 3 * count
         assert np.linalg.eigvalsh(s.P)[0] > -1e-12
@@ -54,7 +54,7 @@ def test_points_of_the_ground_are_where_their_covariance_says():
 @pytest.mark.parametrize("height", [0.02, 0.09])
 def test_a_camera_close_to_the_ground_takes_in_nothing(height):
     filter, _, ids, bearings = standing(np.random.default_rng(2), height)
-    assert ground.take_in(filter, ids, bearings, FLOOR) == 0
+    assert ground.add_ground_landmarks(filter, ids, bearings, FLOOR) == 0
     assert not filter.state.landmarks and filter.state.size == at.CORE_SIZE
 
 

@@ -280,7 +280,7 @@ def test_imu_faults_leave_a_finite_estimate_with_a_larger_covariance(fault, leng
 
 def test_a_lost_filter_says_so_and_starts_again_in_motion(monkeypatch):
     """Blind for so long that velocity is unknown (the bound is lowered for the test): lost, then found by motion."""
-    monkeypatch.setattr("perch_perception.vio.divergence._VELOCITY", 0.03)
+    monkeypatch.setattr("perch_perception.vio.divergence._MAX_VELOCITY_SIGMA", 0.03)
     cover = (1.9, 2.6)
     steps = flights.run_vio(tampered(until(4.4), lambda t, stamp, image: [
         (stamp, np.full_like(image, 3) if cover[0] <= t < cover[1] else image)]))

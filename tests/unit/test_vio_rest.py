@@ -8,7 +8,7 @@ from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import ImuSample
 from perch_perception.vio import FrameOutcome, VioConfig, VisualInertialOdometry
-from perch_perception.vio.start import TOLD_SIGMA
+from perch_perception.vio.start import CONFIGURED_POSE_SIGMA
 
 MS = 1_000_000
 
@@ -87,7 +87,7 @@ def rest(seed, attitude, times, dark, fps=2.0, rate=100.0):
     imu, R = config.imu, so3.exp(ATTITUDES[attitude])
     p, sigma = np.array([0.5, 0.2, 1.2]), np.array([0.001] * 3)
     vio = VisualInertialOdometry(config, mount, p + rng.normal(0.0, sigma), 0.0)
-    vio._known = replace(vio._known, R_WB=so3.exp([0.0, 0.0, rng.normal(0.0, TOLD_SIGMA[3])]) @ R)  # as a filter that was lost here left it
+    vio._known_pose = replace(vio._known_pose, R_WB=so3.exp([0.0, 0.0, rng.normal(0.0, CONFIGURED_POSE_SIGMA[3])]) @ R)  # as left by a lost filter
     bias = rng.normal(0.0, np.repeat([imu.gyro_bias_init, imu.accel_bias_init], 3))
     walk = np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) / np.sqrt(rate)
     noise = np.repeat([imu.gyro_noise_density, imu.accel_noise_density], 3) * np.sqrt(rate)
@@ -136,7 +136,7 @@ def test_what_is_said_of_now_holds_while_a_departure_is_not_yet_noticed():
     config, mount = VioConfig(), load_vehicle("snapdragon").mounts["down"]
     noise = np.repeat([config.imu.gyro_noise_density, config.imu.accel_noise_density], 3) / np.sqrt(0.002)
     for _ in range(12):
-        vio, frame = VisualInertialOdometry(config, mount, rng.normal(0.0, TOLD_SIGMA[:3])), 0.1 + rng.uniform(0.0, 1 / 30)
+        vio, frame = VisualInertialOdometry(config, mount, rng.normal(0.0, CONFIGURED_POSE_SIGMA[:3])), 0.1 + rng.uniform(0.0, 1 / 30)
         for k in range(650):
             t = 0.002 * k
             read = noise * rng.normal(size=6) + [0, 0, 0, 0, 0, 9.81 + 92.0 * max(t - 0.001 - 1.0, 0.0)**3]  # mean of the period

@@ -1,4 +1,4 @@
-"""Sliding tracks: the covariance of a walk, against walks that are simulated."""
+"""Random walk of tracks: the covariance of a walk, against walks that are simulated."""
 
 import dataclasses
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_perception.vio.config import FilterConfig
-from perch_perception.vio.sliding import Sliding
+from perch_perception.vio.sliding import TrackWalk
 
 FOCAL = 275.0
 CONFIG = dataclasses.replace(FilterConfig(), pixel_noise=0.3, slide_turn=2.0, slide_zoom=3.0)
@@ -27,14 +27,14 @@ def test_whitened_observations_of_walking_points_are_white():
     walk = -np.concatenate([np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros((20000, 1))], axis=1)
     noise = np.linspace(1.0, 3.0, len(b))
     seen = walk + rng.normal(size=walk.shape) * noise * CONFIG.pixel_noise / FOCAL
-    sliding = Sliding(CONFIG, FOCAL)
+    sliding = TrackWalk(CONFIG, FOCAL)
     white = sliding.whitened(sliding.steps(b[:-1], b[1:], d[:-1], d[1:]), seen.T, noise) / (CONFIG.pixel_noise / FOCAL)
     assert np.cov(white) == pytest.approx(np.eye(len(b)), abs=0.06)
 
 
 def test_a_view_that_stands_still_makes_nothing_walk():
     b, d = view()
-    sliding = Sliding(CONFIG, FOCAL)
+    sliding = TrackWalk(CONFIG, FOCAL)
     assert sliding.steps(b, b, d, d) == pytest.approx(np.zeros(len(b)), abs=1e-12)
     rows = np.random.default_rng(2).normal(size=(4, 3))
     assert sliding.whitened(np.zeros(3), rows) == pytest.approx(rows)
@@ -43,9 +43,9 @@ def test_a_view_that_stands_still_makes_nothing_walk():
 def test_points_walk_across_the_line_of_sight_only():
     b, d = view()
     R_WC = so3.exp(np.array([0.3, -2.0, 0.4]))
-    P = Sliding(CONFIG, FOCAL).of_points(b[:-1], b[1:], d[:-1], d[1:], R_WC)
+    P = TrackWalk(CONFIG, FOCAL).of_points(b[:-1], b[1:], d[:-1], d[1:], R_WC)
     u = b[1:] @ R_WC.T
     assert np.einsum("ni,nij,nj->n", u, P, u) == pytest.approx(np.zeros(len(u)), abs=1e-15)
     along = R_WC @ np.array([0.0, 1.0, 0.0])
     angle = np.sqrt(np.einsum("i,nij,j->n", along, P, along)) / d[1:]
-    assert angle**2 == pytest.approx(Sliding(CONFIG, FOCAL).steps(b[:-1], b[1:], d[:-1], d[1:]))
+    assert angle**2 == pytest.approx(TrackWalk(CONFIG, FOCAL).steps(b[:-1], b[1:], d[:-1], d[1:]))

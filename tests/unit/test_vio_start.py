@@ -13,7 +13,7 @@ from perch_perception.vio import VioConfig
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import observe
 from perch_perception.vio.motion_start import MotionStart
-from perch_perception.vio.start import told
+from perch_perception.vio.start import configured_pose
 
 MOUNT = load_vehicle("snapdragon").mounts["down"]
 RATE, FRAMES, NOISE = 200.0, 20.0, 0.3
@@ -45,7 +45,7 @@ def begin(name, seed, give_up=3.5):
         t = 0.02 + frame / FRAMES
         ids, pixels = tracks(*truth.at(t + offset)[:2])
         start.add(frame, round(t * 1e9), ids, observe(camera, pixels))
-        state = start.solve(buffer, lambda _: told(np.zeros(3), 0.0))
+        state = start.solve(buffer, lambda _: configured_pose(np.zeros(3), 0.0))
         if state is not None:
             R, _, v = truth.at(t)
             M = R @ state.R_WB.T  # the heading is not what a start tells

@@ -12,7 +12,7 @@ from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.vio import FrameOutcome, VioConfig, VisualInertialOdometry
 from perch_perception.vio import state as at
 from perch_perception.vio.msckf import Msckf
-from perch_perception.vio.start import fresh, told
+from perch_perception.vio.start import configured_pose, initial_state
 from perch_perception.vio.tracker import Features, Tracker
 
 from unit.test_vio_filter import SimulatedTracks
@@ -187,7 +187,7 @@ def test_drift_hardly_depends_on_the_rate_of_the_imu():
                 sample = ImuSample(round(times[k] * 1e9), *(tuple(x[past].mean(axis=0)) for x in (read.gyro, read.accel)))
                 assert buffer.add(sample) is ImuOutcome.USED
             start, end = round(times[0] * 1e9), round(times[-1] * 1e9)
-            s = fresh(config, MOUNT, start, m.R_WB[0], told(m.p_WB[0], 0.0), m.v_WB[0], np.zeros(3), 1e-6, 1e-6, 1e-6)
+            s = initial_state(config, MOUNT, start, m.R_WB[0], configured_pose(m.p_WB[0], 0.0), m.v_WB[0], np.zeros(3), 1e-6, 1e-6, 1e-6)
             Msckf(config, s, MOUNT.camera.fx).propagate(buffer.run(start, end), end)
             ends[every].append(m.p_WB[-1] - s.p_WB)
             sigmas[every] = np.sqrt(np.diag(s.P)[at.POSITION])

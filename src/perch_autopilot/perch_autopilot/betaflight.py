@@ -10,7 +10,7 @@ from perch_core.config import quantity, text
 from perch_core.values import NANOSECONDS, ImuSample, RatesThrust
 from perch_core.vehicle import GRAVITY
 from perch_autopilot import msp
-from perch_autopilot.clock import jumped
+from perch_autopilot.clock import clock_jump
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rates import Sticks, commanded_vehicle, rate_curves
@@ -18,8 +18,8 @@ from perch_autopilot.watchdog import CENTRED, DESCENT, DISARM_AFTER, lifts
 from perch_autopilot.link import REOPEN, LinkError
 
 _HANDSHAKE = 2.0                     # for the autopilot's version [s]
-_REFUSED = NANOSECONDS               # an order to arm that has had no effect for so long is refused [ns]
-_SELDOM = (msp.STATUS, msp.ATTITUDE, msp.ANALOG)
+_REFUSED = NANOSECONDS               # a command to arm without effect for so long is refused [ns]
+_SLOW_REQUESTS = (msp.STATUS, msp.ATTITUDE, msp.ANALOG)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,11 +67,11 @@ class Betaflight(Component[BetaflightParameters]):
         self._polls, self._mode = 0, "disarmed"
         self._attitude: tuple[float, float, float] | None = None
         self._battery: msp.Battery | None = None
-        self._wanted_since: int | None = None   # the host's time since which it has been told to arm without doing so [ns]
-        self._wanted = False                    # it shall turn its motors
-        self._lifted = self._status is not None and self._status.armed  # a command since arming has asked for lift; found armed, it may fly
+        self._arming_since: int | None = None   # the host's time since which it is commanded to arm and is not armed [ns]
+        self._arm_commanded = False             # the motors are commanded to turn
+        self._lifted = self._status is not None and self._status.armed  # a command since arming has commanded lift; armed at the start, it may fly
         self._now: int | None = None            # of the last poll [ns]
-        self._answered = self._diagnosed = self._opened = self._torn = 0
+        self._last_answer = self._last_diagnostics = self._last_open = self._reported_errors = 0
 
     def _opened_link(self) -> SupervisedLink:
         return SupervisedLink(self.config.link, *self._throttles(), self.config.disarm_after, self._sticks.curves[:2])
@@ -82,28 +82,28 @@ class Betaflight(Component[BetaflightParameters]):
 
     def _identify(self) -> msp.Version:
         """Request the firmware's version, and check that it can fly."""
-        wanted = (msp.FC_VARIANT, msp.FC_VERSION, msp.STATUS, msp.ANALOG)
+        required = (msp.FC_VARIANT, msp.FC_VERSION, msp.STATUS, msp.ANALOG)
         answers: dict[int, msp.Frame] = {}
-        last, said = time.monotonic() + _HANDSHAKE, [""]
+        last, reports = time.monotonic() + _HANDSHAKE, [""]
         while time.monotonic() < last:
-            self._link.request(b"".join(map(msp.request, wanted)))
+            self._link.request(b"".join(map(msp.request, required)))
             data, messages = self._link.receive(0.2)
-            said += messages
+            reports += messages
             for frame in self._parser.feed(data):
                 answers[frame.command] = frame
-            if answers.keys() >= set(wanted):
+            if answers.keys() >= set(required):
                 version = msp.version(answers[msp.FC_VARIANT], answers[msp.FC_VERSION])
                 self._status = status = msp.status(answers[msp.STATUS])
-                if status.armed:  # what flies goes on when the node is started again
-                    self._link.turning()
+                if status.armed:  # in flight, it continues when the node is restarted
+                    self._link.report_motors_turning()
                 else:
-                    self._take_battery(msp.battery(answers[msp.ANALOG]).voltage)
+                    self._update_battery(msp.battery(answers[msp.ANALOG]).voltage)
                     if status.lasting:
                         raise msp.MspError(f"{self.config.link}: the autopilot refuses to arm: {'; '.join(status.lasting)}")
                 return version
-        noise = (f"{self._parser.skipped} bytes came that are no MSP: is the baud rate right, and the autopilot's command line closed?"
+        noise = (f"{self._parser.skipped} bytes received that are not MSP: is the baud rate right, and the autopilot's command line closed?"
                  if self._parser.skipped else "")
-        raise msp.MspError("; ".join(filter(None, (f"{self.config.link}: no autopilot answers within {_HANDSHAKE:g} s", said[-1], noise))))
+        raise msp.MspError("; ".join(filter(None, (f"{self.config.link}: no autopilot answers within {_HANDSHAKE:g} s", reports[-1], noise))))
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
@@ -111,9 +111,9 @@ class Betaflight(Component[BetaflightParameters]):
         """Send a command to the autopilot; it is in effect until the next one, or until it is stale."""
         values = (*command.w_B, command.thrust)
         if not sum(value * value for value in values) < 1e8:
-            self.warn(f"rates_thrust_command: {values} is not finite, or beyond any vehicle: ignored", min_interval=1.0)
+            self.warn(f"rates_thrust_command: {values} is not finite, or too large: ignored", min_interval=1.0)
             return
-        self._wanted = command.armed
+        self._arm_commanded = command.armed
         sticks = self._sticks.channels(command.w_B, command.thrust) if command.armed else CENTRED
         self._lifted = command.armed and (self._lifted or lifts(sticks, self._throttles()[0]))
         self._link.command(command.armed, sticks)
@@ -122,36 +122,36 @@ class Betaflight(Component[BetaflightParameters]):
 
     def on_poll(self, now: int) -> None:
         """Process the newest answer of each kind; request the next IMU sample, and the other data in turn."""
-        if self._now is None or (jump := jumped(self._now, now)):
-            self._answered, self._diagnosed, self._wanted_since = now, now - NANOSECONDS, None
+        if self._now is None or (jump := clock_jump(self._now, now)):
+            self._last_answer, self._last_diagnostics, self._arming_since = now, now - NANOSECONDS, None
             if self._now is not None:
                 self.warn(jump)
         self._now = now
         try:
-            data, said = self._link.receive()
+            data, messages = self._link.receive()
         except LinkError as error:
-            data, said = b"", []
+            data, messages = b"", []
             self._reopen(now, error)
-        for line in said:
+        for line in messages:
             self._mode = line
             self.log(LogLine("info" if line in ("disarmed", "following") else "warning", f"autopilot: {line}"))
         for frame in {frame.command: frame for frame in self._parser.feed(data)}.values():
-            self._take(frame, now)
+            self._handle_frame(frame, now)
         self._polls += 1
-        asked = msp.request(msp.RAW_IMU)
+        requests = msp.request(msp.RAW_IMU)
         if self._polls % 10 == 0:
-            asked += msp.request(_SELDOM[self._polls // 10 % len(_SELDOM)])
-        self._link.request(asked)
-        if now - self._diagnosed >= NANOSECONDS:
-            self._diagnosed = now
+            requests += msp.request(_SLOW_REQUESTS[self._polls // 10 % len(_SLOW_REQUESTS)])
+        self._link.request(requests)
+        if now - self._last_diagnostics >= NANOSECONDS:
+            self._last_diagnostics = now
             self._diagnose(now)
 
     def _reopen(self, now: int, ended: LinkError) -> None:
         """Restart the link's process: in flight, the vehicle follows the next command or descends; on the ground, it idles."""
-        if 0 <= now - self._opened < REOPEN * NANOSECONDS:
+        if 0 <= now - self._last_open < REOPEN * NANOSECONDS:
             return
-        self._opened = now
-        self.log(LogLine("error", f"{ended}: another one is started", 1.0))
+        self._last_open = now
+        self.log(LogLine("error", f"{ended}: it is restarted", 1.0))
         try:
             link = self._opened_link()
         except LinkError as error:
@@ -160,55 +160,55 @@ class Betaflight(Component[BetaflightParameters]):
         self._link.close()
         self._link = link
         if self._status is not None and self._status.armed:
-            if self._lifted or not self._wanted:
-                link.turning()
-            if self._wanted:
+            if self._lifted or not self._arm_commanded:
+                link.report_motors_turning()
+            if self._arm_commanded:
                 link.command(True, self._sticks.channels((0.0, 0.0, 0.0), GRAVITY) if self._lifted else CENTRED)
 
-    def _take(self, frame: msp.Frame, now: int) -> None:
+    def _handle_frame(self, frame: msp.Frame, now: int) -> None:
         try:
             if frame.command == msp.RAW_IMU:
                 force, rate = msp.inertial(frame, self.config.one_g)
                 self.imu(ImuSample(now, rate, force))
-                self._answered = now
+                self._last_answer = now
             elif frame.command == msp.STATUS:
                 self._status = msp.status(frame)
-                self._judge_arming(self._status, now)
+                self._check_arming(self._status, now)
             elif frame.command == msp.ATTITUDE:
                 self._attitude = msp.attitude(frame)
             elif frame.command == msp.ANALOG:
                 self._battery = msp.battery(frame)
-                self._take_battery(self._battery.voltage)
+                self._update_battery(self._battery.voltage)
         except msp.MspError as error:
             self.warn(str(error), min_interval=1.0)
 
-    def _take_battery(self, voltage: float) -> None:
+    def _update_battery(self, voltage: float) -> None:
         if self._sticks.battery.reference:
-            self._sticks.measured(voltage)
+            self._sticks.set_voltage(voltage)
             self._link.set_throttles(*self._throttles())
-            if not self._sticks.fits(voltage):
+            if not self._sticks.covers_voltage(voltage):
                 low, high = self._sticks.battery.range
                 raise msp.MspError(f"the battery has {voltage:g} V: the thrust curve of {self.config.vehicle} (actuation.battery) is of "
                                    f"{low:g} to {high:g} V")
 
-    def _judge_arming(self, status: msp.Status, now: int) -> None:
+    def _check_arming(self, status: msp.Status, now: int) -> None:
         """Report why the autopilot does not arm; it gives no reason if it does not use the arming switch of this node."""
-        if not self._wanted or status.armed:
-            self._wanted_since = None
-        elif self._wanted_since is None:
-            self._wanted_since = now
-        elif now - self._wanted_since > _REFUSED:
+        if not self._arm_commanded or status.armed:
+            self._arming_since = None
+        elif self._arming_since is None:
+            self._arming_since = now
+        elif now - self._arming_since > _REFUSED:
             reasons = "; ".join(status.refusals) or (
-                "the pilot has not handed over: switch MSP OVERRIDE on" if self._mode == "following" else "commands had stopped: disarm first")
+                "the pilot has not handed over: switch MSP OVERRIDE on" if self._mode == "following" else "commands have stopped: disarm first")
             self.log(LogLine("error", f"the autopilot refuses to arm: {reasons}", 2.0))
 
     def _diagnose(self, now: int) -> None:
-        if silent := now - self._answered > NANOSECONDS:
+        if silent := now - self._last_answer > NANOSECONDS:
             self.log(LogLine("error", f"{self.config.link}: the autopilot is silent: check its power and its link", 5.0))
-        if self._parser.torn > self._torn:
-            self._torn = self._parser.torn
-            self.warn(f"{self.config.link}: torn frames come from the autopilot: check the link and its baud rate", min_interval=5.0)
-        values = {"firmware": str(self.version), "mode": self._mode, "torn_frames": self._parser.torn,
+        if self._parser.checksum_errors > self._reported_errors:
+            self._reported_errors = self._parser.checksum_errors
+            self.warn(f"{self.config.link}: corrupt frames received from the autopilot: check the link and its baud rate", min_interval=5.0)
+        values = {"firmware": str(self.version), "mode": self._mode, "torn_frames": self._parser.checksum_errors,
                   "skipped_bytes": self._parser.skipped}
         if self._status is not None:
             values |= {"armed": self._status.armed, "refusals": "; ".join(self._status.refusals)}

@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     try:
         if args.verb == "build":
-            print(firmware.ensured())
+            print(firmware.ensure_program())
             return 0
         configuration = load_configuration(args.configuration)
         link = Link(args.link)

@@ -57,7 +57,7 @@ def load_configuration(name: str) -> Configuration:
     lines = tuple(line for raw in text.splitlines() if (line := " ".join(raw.split("#")[0].split())))
     for line in lines:
         if not (_SET.fullmatch(line) or line.split()[0] in ("feature", "aux", "map", "serial", "mixer")):
-            raise ConfigError(str(file), line, "is none of set NAME = VALUE, feature, aux, map, serial, mixer")
+            raise ConfigError(str(file), line, "is not one of set NAME = VALUE, feature, aux, map, serial, mixer")
     if not lines:
         raise ConfigError(str(file), "", "has no line")
     return Configuration(str(file), lines)
@@ -76,9 +76,9 @@ class Cli:
             CliError: the firmware does not answer.
         """
         self._send, self._receive, self._saved = send, receive, False
-        self.ask("#", end="")
+        self.query("#", end="")
 
-    def ask(self, line: str, end: str = "\r\n") -> str:
+    def query(self, line: str, end: str = "\r\n") -> str:
         """Send a line and return the answer.
 
         Raises:
@@ -89,7 +89,7 @@ class Cli:
         while not text.endswith(b"\n# "):
             text += self._receive(0.1)
             if time.monotonic() > last:
-                noise = f": {len(text)} bytes came, at last {text[-8:]!r}: is the baud rate right?" if text else ""
+                noise = f": {len(text)} bytes received, the last {text[-8:]!r}: is the baud rate right?" if text else ""
                 raise CliError(f"the autopilot's command line does not answer {line!r} within {_ANSWER_TIME:g} s{noise}")
         return text.decode("ascii", "replace")
 
@@ -100,7 +100,7 @@ class Cli:
             CliError: a line is refused.
         """
         for line in configuration.lines:
-            answer = self.ask(line)
+            answer = self.query(line)
             if "###ERROR" in answer or "INVALID" in answer.upper() or "UNKNOWN" in answer.upper():
                 words = " ".join(answer.replace(line, "").strip(" #\r\n").split())
                 raise CliError(f"{configuration.source}: {line}: the firmware refuses it: {words[:200]}")
@@ -118,11 +118,11 @@ class Cli:
         Raises:
             CliError: a setting differs.
         """
-        found = dump_lines(self.ask("dump"))
+        found = dump_lines(self.query("dump"))
         wrong = differences(configuration.lines, found)
         if wrong:
             more = f"; and {len(wrong) - 5} more" if len(wrong) > 5 else ""
-            raise CliError(f"{configuration.source}: the autopilot is set otherwise: " + "; ".join(wrong[:5]) + more)
+            raise CliError(f"{configuration.source}: the autopilot's settings differ: " + "; ".join(wrong[:5]) + more)
 
 
 def dump_lines(answer: str) -> list[str]:

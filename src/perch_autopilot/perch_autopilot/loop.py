@@ -15,8 +15,8 @@ from perch_autopilot.rates import Sticks, rate_curves
 from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
 from perch_autopilot.watchdog import CENTRED, DESCENT, OFF, ON, Watchdog
 
-_SETTLED = 500            # cycles on the bench before it is armed: a radio that has just come counts after half a second
-_LAST = 500               # cycles in which it arms there, or does not at all
+_SETTLED = 500            # cycles on the bench before it is armed: a new radio signal is accepted after half a second
+_LAST = 500               # cycles on the bench within which it must arm
 _STILL = (0.0, 0.0, 0.0)
 
 
@@ -35,10 +35,10 @@ class FirmwareLoop:
     Attributes:
         sitl: the firmware.
         watchdog: replaces commands that stop.
-        watches: the loop itself handles commands that stop, instead of the motors' time-out.
+        handles_command_timeout: the loop itself handles commands that stop, instead of the motors' time-out.
     """
 
-    watches = True
+    handles_command_timeout = True
 
     def __init__(self, vehicle: Vehicle, voltage_factor: float = 1.0) -> None:
         """
@@ -52,9 +52,9 @@ class FirmwareLoop:
         """
         loaded = load_configuration(vehicle.actuation.firmware)
         self.sticks = Sticks(vehicle, rate_curves(loaded.settings, loaded.source))
-        self.sticks.measured(voltage_factor * vehicle.actuation.battery.reference)
+        self.sticks.set_voltage(voltage_factor * vehicle.actuation.battery.reference)
         self._voltage_factor = voltage_factor
-        # The throttle follows when the motors turn: they are seen here.
+        # No delay after arming: `channels` raises the throttle only when the motors turn.
         self.watchdog = Watchdog(self.sticks.throttle_for(1.0), self.sticks.throttle_for(DESCENT), arming=0.0)
         self._low, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
         self._idle = float(loaded.settings.get("motor_idle", 550)) * 1e-4  # motors of an armed vehicle with the throttle down
@@ -75,7 +75,7 @@ class FirmwareLoop:
             motors = self.sitl.step(_STILL, GRAVITY, LEVEL, (*CENTRED, switch))
             if min(motors) > 0.5 * self._idle if switch == ON else max(motors) == 0.0:
                 return
-        reasons = ", ".join(self.sitl.status().refusals) or "it gives no reason"
+        reasons = ", ".join(self.sitl.status().refusals) or "no reason given"
         raise FirmwareError(f"Betaflight's firmware does not {what}: {reasons}")
 
     def command(self, now: int, armed: bool, rates: Sequence[float], thrust: float) -> None:

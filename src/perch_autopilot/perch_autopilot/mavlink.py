@@ -22,13 +22,13 @@ from perch_core.config import quantity, text
 from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, ImuSample, OdometryState, RatesThrust
 from perch_autopilot import frames
-from perch_autopilot.clock import JUMP, jumped
-from perch_autopilot.offboard import ARDUPILOT, GUID_OPTIONS, PX4, SILENT, THRUST_AS_THRUST, Ask, Offboard
+from perch_autopilot.clock import MAX_STEP, clock_jump
+from perch_autopilot.offboard import ARDUPILOT, GUID_OPTIONS, HEARTBEAT_TIMEOUT, PX4, THRUST_AS_THRUST, Offboard, Request
 from perch_autopilot.link import REOPEN, Link, LinkError
 from perch_autopilot.rates import commanded_vehicle
 
 _HANDSHAKE = 3.0                     # for the autopilot's first heartbeat, which come once a second [s]
-_JUMPED = 3                          # samples in a row that do not follow the last one: its clock has jumped
+_JUMP_SAMPLES = 3                          # samples in a row that do not follow the last one: its clock has clock_jump
 _STALE = 100_000_000                 # a command that is older is not sent any more [ns]
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
 _COMMANDS = {176: "the mode", 400: "arming"}
@@ -101,9 +101,10 @@ class Mavlink(Component[MavlinkParameters]):
         self.offboard, self._clock = Offboard(), ClockOffset()
         self._command: RatesThrust | None = None
         self._now: int | None = None         # of the last poll [ns]
-        self._begun = self._came = self._second = self._opened = self._torn = self._named = self._jumps = 0
-        self._sent: int | None = None        # stamp of the last odometry that was sent [ns]
-        self._sampled: int | None = None     # stamp of its last sample, by its own clock [ns]
+        self._start_time = self._command_time = self._last_heartbeat = self._opened = self._jumps = 0
+        self._corrupt_frames = self._reported_frames = 0
+        self._last_odometry: int | None = None  # stamp of the last odometry that was sent [ns]
+        self._last_sample: int | None = None    # stamp of the autopilot's last sample, by its own clock [ns]
         try:
             self._identify(link)
         except BaseException:
@@ -116,24 +117,24 @@ class Mavlink(Component[MavlinkParameters]):
         while not self.offboard.autopilot and (left := last - time.monotonic()) > 0.0:
             for message in self._mavlink.parse_buffer(link.read(left)) or ():
                 if message.get_type() in ("HEARTBEAT", "BAD_DATA"):
-                    self._take(message, 0)
-        if trouble := self._absent(0):
-            raise PerchError(f"{self.config.link}: {trouble}")
+                    self._handle_message(message, 0)
+        if problem := self._absence_reason(0):
+            raise PerchError(f"{self.config.link}: {problem}")
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Store a command, which each poll sends until it is stale."""
         if not sum(value * value for value in (*command.w_B, command.thrust)) < 1e8:
-            self.warn("rates_thrust_command: not finite, or beyond any vehicle: ignored", min_interval=1.0)
+            self.warn("rates_thrust_command: not finite, or too large: ignored", min_interval=1.0)
             return
-        self._command, self._came = command, self._now or 0
+        self._command, self._command_time = command, self._now or 0
 
     def on_odometry(self, state: OdometryState) -> None:
         """Send odometry to the autopilot's own estimator, in its axes, stamped by the host's clock (TIMESYNC); 50 Hz at most."""
-        if self._sent is not None and 0 <= state.stamp - self._sent < _ODOMETRY_PERIOD:
+        if self._last_odometry is not None and 0 <= state.stamp - self._last_odometry < _ODOMETRY_PERIOD:
             return
-        self._sent = state.stamp
+        self._last_odometry = state.stamp
         mavlink = self._mavlink
         x, y, z = frames.world(state.p_WB)
         measured = state.twist_covariance[0, 0] >= 0.0
@@ -150,9 +151,9 @@ class Mavlink(Component[MavlinkParameters]):
             self._link.write(message.pack(self._mavlink))
             self._mavlink.seq = (self._mavlink.seq + 1) % 256
         except LinkError as error:
-            self._lose(error)
+            self._on_link_lost(error)
 
-    def _target(self, command: RatesThrust) -> None:
+    def _send_set_point(self, command: RatesThrust) -> None:
         rates = frames.body(np.array(command.w_B)) if command.armed else np.zeros(3)
         thrust = min(max(command.thrust / self._thrust_max, 0.0), 1.0) if command.armed else 0.0
         self._send(self._mavlink.set_attitude_target_encode(
@@ -162,25 +163,25 @@ class Mavlink(Component[MavlinkParameters]):
 
     def on_poll(self, now: int) -> None:
         """Process received messages; send the command while it is fresh; once a second, heartbeat and TIMESYNC."""
-        if self._now is None or (jump := jumped(self._now, now)):
-            self._command, self._clock, self._begun, self._second = None, ClockOffset(), now, now - NANOSECONDS
+        if self._now is None or (jump := clock_jump(self._now, now)):
+            self._command, self._clock, self._start_time, self._last_heartbeat = None, ClockOffset(), now, now - NANOSECONDS
             if self._now is not None:
                 self.warn(jump)
         self._now = now
         for message in self._mavlink.parse_buffer(self._received(now)) or ():
-            self._take(message, now)
+            self._handle_message(message, now)
         command = self._command if self.offboard.takes_thrust else None
-        if command is not None and not 0 <= now - self._came <= _STALE:
+        if command is not None and not 0 <= now - self._command_time <= _STALE:
             command = None
         if command is not None:
-            self._target(command)
-        ask = self.offboard.ask(now * 1e-9, command is not None and command.armed, command is not None)
-        if ask is Ask.MODE:
-            self._order(176, 1.0, *_mode_words(self.offboard.mode))                    # MAV_CMD_DO_SET_MODE
-        elif ask is not Ask.NOTHING:
-            self._order(400, 1.0 if ask is Ask.ARM else 0.0)                           # MAV_CMD_COMPONENT_ARM_DISARM
-        if now - self._second >= NANOSECONDS:
-            self._second = now
+            self._send_set_point(command)
+        request = self.offboard.next_request(now * 1e-9, command is not None and command.armed, command is not None)
+        if request is Request.MODE:
+            self._send_command(176, 1.0, *_mode_words(self.offboard.mode))             # MAV_CMD_DO_SET_MODE
+        elif request is not Request.NOTHING:
+            self._send_command(400, 1.0 if request is Request.ARM else 0.0)            # MAV_CMD_COMPONENT_ARM_DISARM
+        if now - self._last_heartbeat >= NANOSECONDS:
+            self._last_heartbeat = now
             self._send(self._mavlink.heartbeat_encode(18, 8, 0, 0, 4))                 # ONBOARD_CONTROLLER, INVALID, ACTIVE
             self._send(self._mavlink.timesync_encode(0, now))
             if not self.offboard.takes_thrust:
@@ -195,28 +196,28 @@ class Mavlink(Component[MavlinkParameters]):
                 self._link = Link(self.config.link)
             return b"" if self._link is None else self._link.read()
         except LinkError as error:
-            self._lose(error)
+            self._on_link_lost(error)
             return b""
 
-    def _lose(self, error: LinkError) -> None:
+    def _on_link_lost(self, error: LinkError) -> None:
         """Close a link that has ended, and reset all state but the autopilot's type and options."""
         self.log(LogLine("error", str(error), 1.0))
         self.close()
         self.offboard = Offboard(self.offboard.autopilot, options=self.offboard.options)
-        self._clock, self._sampled = ClockOffset(), None
+        self._clock, self._last_sample = ClockOffset(), None
 
-    def _order(self, command: int, *words: float) -> None:
+    def _send_command(self, command: int, *words: float) -> None:
         self._send(self._mavlink.command_long_encode(self.config.system, 1, command, 0, *words, *(0.0,) * (7 - len(words))))
 
-    def _take(self, message: Any, now: int) -> None:
+    def _handle_message(self, message: Any, now: int) -> None:
         kind = message.get_type()
         if kind == "BAD_DATA":
-            self._torn += 1
+            self._corrupt_frames += 1
         elif message.get_srcSystem() != self.config.system:
             return
         elif kind == "HEARTBEAT" and message.get_srcComponent() == 1:
             self.offboard.heartbeat(now * 1e-9, message.autopilot, message.base_mode, message.custom_mode)
-        elif kind == "HIGHRES_IMU" and self._known(message.time_usec * 1000, now):
+        elif kind == "HIGHRES_IMU" and self._can_convert_stamp(message.time_usec * 1000, now):
             f = frames.body(np.array([message.xacc, message.yacc, message.zacc]))
             w = frames.body(np.array([message.xgyro, message.ygyro, message.zgyro]))
             self.imu(ImuSample(message.time_usec * 1000 + self._clock.offset, tuple(w.tolist()), tuple(f.tolist())))
@@ -231,47 +232,48 @@ class Mavlink(Component[MavlinkParameters]):
             word = _RESULTS[message.result] if message.result < len(_RESULTS) else str(message.result)
             self.log(LogLine("error", f"the autopilot refuses {_COMMANDS[message.command]}: {word}", 1.0))
         elif kind == "STATUSTEXT":
-            said = message.text if isinstance(message.text, str) else bytes(message.text).split(b"\0")[0].decode(errors="replace")
-            self.log(LogLine("warning" if message.severity <= 4 else "info", f"autopilot: {said}", 1.0))
+            status = message.text if isinstance(message.text, str) else bytes(message.text).split(b"\0")[0].decode(errors="replace")
+            self.log(LogLine("warning" if message.severity <= 4 else "info", f"autopilot: {status}", 1.0))
 
-    def _known(self, stamp: int, now: int) -> bool:
+    def _can_convert_stamp(self, stamp: int, now: int) -> bool:
         """Return whether a sample's stamp, by the autopilot's clock [ns], can be converted; after a jump, request the offset."""
-        if self._sampled is not None and not 0 <= stamp - self._sampled < JUMP:
+        if self._last_sample is not None and not 0 <= stamp - self._last_sample < MAX_STEP:
             self._jumps += 1
-            if self._jumps < _JUMPED:
+            if self._jumps < _JUMP_SAMPLES:
                 return False
-            self.warn(f"the autopilot's clock went from {self._sampled * 1e-9:.3f} to {stamp * 1e-9:.3f} s at once: it has started anew?")
+            self.warn(f"the autopilot's clock went from {self._last_sample * 1e-9:.3f} to {stamp * 1e-9:.3f} s at once: it may have restarted")
             self._clock = ClockOffset()
             self._send(self._mavlink.timesync_encode(0, now))
-        self._sampled, self._jumps = stamp, 0
+        self._last_sample, self._jumps = stamp, 0
         return self._clock.offset is not None
 
-    def _trouble(self, now: int) -> str:
+    def _problem(self, now: int) -> str:
         """Return why the autopilot cannot follow set points; empty if it can."""
-        if absent := self._absent(now):
-            return absent
+        if absence := self._absence_reason(now):
+            return absence
         if not self.offboard.takes_thrust:
             return f"ArduPilot's {GUID_OPTIONS} does not have bit 3 (value {THRUST_AS_THRUST}), so that thrust is a climb rate: set it; not armed"
         return ""
 
-    def _absent(self, now: int) -> str:
+    def _absence_reason(self, now: int) -> str:
         """Return why no usable autopilot is present; empty if there is one."""
         if not self.offboard.alive(now * 1e-9):
-            noise = f"; {self._torn} torn frames: is the baud rate right?" if self._torn else ": check its power, link and system id"
+            noise = (f"; {self._corrupt_frames} corrupt frames: is the baud rate right?" if self._corrupt_frames
+                     else ": check its power, link and system id")
             return f"no heartbeat of the autopilot{noise}"
         if self.offboard.autopilot not in (PX4, ARDUPILOT):
             return f"the autopilot is of MAVLink's type {self.offboard.autopilot}, not PX4 ({PX4}) or ArduPilot ({ARDUPILOT}): not armed"
         return ""
 
     def _diagnose(self, now: int) -> None:
-        if (trouble := self._trouble(now)) and now - self._begun >= SILENT * NANOSECONDS:
-            self.log(LogLine("error", trouble, 5.0))
-        elif not trouble and self._torn > self._named:
-            self.warn("torn frames come from the autopilot: check the link and its baud rate", min_interval=5.0)
-            self._named = self._torn
-        self.diagnostics(Diagnostics(now, {"armed": self.offboard.armed, "following": self.offboard.following, "torn_frames": self._torn,
-                                           "clock_offset_s": (self._clock.offset or 0) * 1e-9},
-                                     2 if trouble else 0, trouble or "ok"))
+        if (problem := self._problem(now)) and now - self._start_time >= HEARTBEAT_TIMEOUT * NANOSECONDS:
+            self.log(LogLine("error", problem, 5.0))
+        elif not problem and self._corrupt_frames > self._reported_frames:
+            self.warn("corrupt frames received from the autopilot: check the link and its baud rate", min_interval=5.0)
+            self._reported_frames = self._corrupt_frames
+        self.diagnostics(Diagnostics(now, {"armed": self.offboard.armed, "following": self.offboard.following,
+                                           "torn_frames": self._corrupt_frames, "clock_offset_s": (self._clock.offset or 0) * 1e-9},
+                                     2 if problem else 0, problem or "ok"))
 
     def close(self) -> None:
         """Close the link: the autopilot's failsafe for the loss of set points takes effect."""

@@ -81,16 +81,16 @@ class Parser:
     """Finds answers in a stream of bytes that arrives in pieces of any size.
 
     Attributes:
-        torn: number of frames with a wrong checksum.
+        checksum_errors: number of frames with a wrong checksum.
         skipped: number of bytes that belong to no frame.
     """
 
     def __init__(self) -> None:
         self._bytes = bytearray()
-        self.torn = self.skipped = 0
+        self.checksum_errors = self.skipped = 0
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that `data` completes. Bytes outside frames are skipped; of a torn frame, the first byte."""
+        """Return the frames that `data` completes. Bytes outside frames are skipped; of a corrupt frame, the first byte."""
         self._bytes += data
         buffer = self._bytes
         found: list[Frame] = []
@@ -111,7 +111,7 @@ class Parser:
             elif len(buffer) < size + 6:
                 return found
             elif _checksum(bytes(buffer[3:size + 5])) != buffer[size + 5]:
-                self.torn += 1
+                self.checksum_errors += 1
                 self._skip()
             else:
                 found.append(Frame(buffer[4], bytes(buffer[5:size + 5]), buffer[2] == ord("!")))

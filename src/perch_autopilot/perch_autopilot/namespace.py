@@ -64,7 +64,7 @@ class IsolatedProgram:
                 [unshare, "--user", "--map-root-user", "--net", sys.executable, "-I", "-S", "-c", _INSIDE, str(theirs.fileno()), str(port),
                  *map(str, program)],
                 cwd=folder, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-                start_new_session=True)  # a Ctrl-C is its parent's business
+                start_new_session=True)  # not interrupted by Ctrl-C
             theirs.close()
             ours.settimeout(_TIMEOUT)
             try:

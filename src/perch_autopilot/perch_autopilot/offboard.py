@@ -10,12 +10,12 @@ ARMED = 128                         # MAV_MODE_FLAG_SAFETY_ARMED
 OFFBOARD, GUIDED_NOGPS = 6 << 16, 20  # custom modes: PX4's main mode, ArduPilot's copter mode
 GUID_OPTIONS = "GUID_OPTIONS"       # parameter of ArduPilot
 THRUST_AS_THRUST = 8                # its bit SetAttitudeTarget_ThrustAsThrust: a thrust, no climb rate
-SETTLED = 0.5                       # set points are sent for so long before the mode is asked for; PX4 wants more than 2 Hz [s]
-AGAIN = 1.0                         # between two requests for the same [s]
-SILENT = 2.0                        # without a heartbeat for so long the autopilot is gone [s]
+MIN_STREAMING_TIME = 0.5            # set points are sent for so long before the mode is requested; PX4 requires more than 2 Hz [s]
+REQUEST_PERIOD = 1.0                # between two requests [s]
+HEARTBEAT_TIMEOUT = 2.0             # without a heartbeat for so long the autopilot is considered absent [s]
 
 
-class Ask(Enum):
+class Request(Enum):
     """Request to the autopilot."""
 
     NOTHING = 0
@@ -39,9 +39,9 @@ class Offboard:
     armed: bool = False
     following: bool = False
     options: int = 0
-    _heard: float = -1e9
-    _streaming: float | None = None
-    _asked: float = -1e9
+    _last_heartbeat: float = -1e9
+    _streaming_since: float | None = None
+    _last_request: float = -1e9
 
     @property
     def mode(self) -> int:
@@ -50,7 +50,7 @@ class Offboard:
 
     def heartbeat(self, now: float, autopilot: int, base_mode: int, custom_mode: int) -> None:
         """Record a heartbeat of the autopilot at a time [s]."""
-        self._heard, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
+        self._last_heartbeat, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
         self.following = custom_mode == self.mode
 
     @property
@@ -60,10 +60,10 @@ class Offboard:
 
     def alive(self, now: float) -> bool:
         """Return whether the last heartbeat is recent at a time [s]."""
-        return 0.0 <= now - self._heard < SILENT
+        return 0.0 <= now - self._last_heartbeat < HEARTBEAT_TIMEOUT
 
-    def ask(self, now: float, wanted: bool, streaming: bool) -> Ask:
-        """Return the request to send at a time, at most one each `AGAIN` seconds.
+    def next_request(self, now: float, wanted: bool, streaming: bool) -> Request:
+        """Return the request to send at a time, at most one each `REQUEST_PERIOD` seconds.
 
         The mode is requested with the motors off only: in flight the pilot selects it, and leaves it.
 
@@ -73,17 +73,17 @@ class Offboard:
             streaming: whether set points are being sent.
         """
         if not streaming:
-            self._streaming = None
-        elif self._streaming is None or now < self._streaming:
-            self._streaming = now
-        step = Ask.NOTHING
+            self._streaming_since = None
+        elif self._streaming_since is None or now < self._streaming_since:
+            self._streaming_since = now
+        request = Request.NOTHING
         if not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
-            return step
+            return request
         if not wanted:
-            step = Ask.DISARM if streaming and self.armed and self.following else step
-        elif not self.armed and self._streaming is not None and now - self._streaming >= SETTLED:
-            step = Ask.ARM if self.following else Ask.MODE
-        if step is Ask.NOTHING or 0.0 <= now - self._asked < AGAIN:
-            return Ask.NOTHING
-        self._asked = now
-        return step
+            request = Request.DISARM if streaming and self.armed and self.following else request
+        elif not self.armed and self._streaming_since is not None and now - self._streaming_since >= MIN_STREAMING_TIME:
+            request = Request.ARM if self.following else Request.MODE
+        if request is Request.NOTHING or 0.0 <= now - self._last_request < REQUEST_PERIOD:
+            return Request.NOTHING
+        self._last_request = now
+        return request

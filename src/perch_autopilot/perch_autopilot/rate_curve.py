@@ -15,17 +15,17 @@ class RateCurve:
 
     Attributes:
         centre: c, slope at the centre of the stick [deg/s].
-        most: m >= c, rate at the end of the stick [deg/s].
+        maximum: m >= c, rate at the end of the stick [deg/s].
         expo: e, 0..1.
     """
 
     centre: float
-    most: float
+    maximum: float
     expo: float
 
     def rate(self, stick: float) -> float:
         """Return the angular velocity [deg/s] at a stick deflection in [-1, 1]."""
-        return self.centre * stick + (self.most - self.centre) * abs(stick) * (self.expo * stick**5 + (1 - self.expo) * stick)
+        return self.centre * stick + (self.maximum - self.centre) * abs(stick) * (self.expo * stick**5 + (1 - self.expo) * stick)
 
     def stick(self, rate: float) -> float:
         """Return the stick deflection that commands a rate [deg/s], in [-1, 1]. By bisection, as the curve is monotonic."""

@@ -10,7 +10,7 @@ from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
 from perch_autopilot.rate_curve import CENTRE, HALF, RateCurve
 
 LOW, HIGH = 1000, 2000  # pulse widths [us]
-FASTEST = 1998.0        # rate that the firmware can command [deg/s]
+RATE_MAX = 1998.0       # rate that the firmware can command [deg/s]
 AXES = ("roll", "pitch", "yaw")
 
 
@@ -21,24 +21,24 @@ def rate_curves(settings: dict[str, str], source: str) -> tuple[RateCurve, ...]:
         ConfigError: the curves are of another type, a setting is missing, or a value is outside the firmware's range.
     """
     if settings.get("rates_type") != "ACTUAL":
-        raise ConfigError(source, "rates_type", f"{settings.get('rates_type')} is not ACTUAL, the one type that is known here")
+        raise ConfigError(source, "rates_type", f"{settings.get('rates_type')} is not ACTUAL, the only supported type")
 
     def value(key: str, low: float, high: float) -> float:
         try:
             number = float(settings[key])
         except KeyError:
-            raise ConfigError(source, key, "is not set: the sticks' meaning depends on it") from None
+            raise ConfigError(source, key, "is not set: stick positions depend on it") from None
         except ValueError:
-            raise ConfigError(source, key, f"{settings[key]} is no number") from None
+            raise ConfigError(source, key, f"{settings[key]} is not a number") from None
         if not low <= number <= high:
             raise ConfigError(source, key, f"{number:g} is outside [{low:g}, {high:g}]")
         return number
 
     curves = []
     for axis in AXES:
-        centre = value(f"{axis}_rc_rate", 1.0, FASTEST / 10.0)
-        most = value(f"{axis}_srate", centre, FASTEST / 10.0)
-        curves.append(RateCurve(10.0 * centre, 10.0 * most, value(f"{axis}_expo", 0.0, 100.0) / 100.0))
+        centre = value(f"{axis}_rc_rate", 1.0, RATE_MAX / 10.0)
+        maximum = value(f"{axis}_srate", centre, RATE_MAX / 10.0)
+        curves.append(RateCurve(10.0 * centre, 10.0 * maximum, value(f"{axis}_expo", 0.0, 100.0) / 100.0))
     return tuple(curves)
 
 
@@ -70,22 +70,22 @@ class Sticks:
         """
         self.curves, self._mass, self._coefficient = curves, vehicle.mass, vehicle.thrust_coefficient
         self._idle, self._span = vehicle.speed_min, vehicle.speed_max - vehicle.speed_min
-        self.battery, self._share = vehicle.actuation.battery, 1.0
+        self.battery, self._voltage_factor = vehicle.actuation.battery, 1.0
 
-    def fits(self, voltage: float) -> bool:
+    def covers_voltage(self, voltage: float) -> bool:
         """Return whether the thrust curve covers a battery voltage [V]."""
         low, high = self.battery.range
         return not self.battery.reference or low <= voltage <= high
 
-    def measured(self, voltage: float) -> None:
+    def set_voltage(self, voltage: float) -> None:
         """Set the battery's voltage [V], clamped to the range of the thrust curve."""
         if self.battery.reference:
             low, high = self.battery.range
-            self._share = (min(max(voltage, low), high) / self.battery.reference) ** self.battery.exponent
+            self._voltage_factor = (min(max(voltage, low), high) / self.battery.reference) ** self.battery.exponent
 
     def throttle(self, thrust: float) -> float:
         """Return the throttle 0..1 for a collective thrust per mass [m/s^2]; the rotor speed is linear in the throttle."""
-        speed = sqrt(max(thrust, 0.0) * self._mass / (4.0 * self._coefficient * self._share))
+        speed = sqrt(max(thrust, 0.0) * self._mass / (4.0 * self._coefficient * self._voltage_factor))
         return min(max((speed - self._idle) / self._span, 0.0), 1.0)
 
     def throttle_for(self, share: float) -> int:

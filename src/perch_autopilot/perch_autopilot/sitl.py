@@ -28,7 +28,7 @@ CHANNELS = 16
 _FROM_PACKET = (2, 1, 3, 0)       # front left, rear left, rear right, front right
 _STATE, _STICKS, _MOTORS = struct.Struct("<18d"), struct.Struct("<d16H"), struct.Struct("<4f")
 _START = 10.0                     # for the firmware to open its port [s]
-_ANSWER = 5.0                     # for motors after a state; a busy machine takes its time [s]
+_ANSWER = 5.0                     # for motors after a state, on a busy machine [s]
 _FOLDER = "perch-betaflight-"     # in which it finds its memory; removed when it has read it
 _ORPHAN = 600.0                   # age of a folder whose owner was killed before that [s]
 CYCLE = 0.002                     # between states that are sent [s]
@@ -37,7 +37,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)      # w x y z
 GRAVITY = (0.0, 0.0, 9.81)
 
 
-class Frozen(FirmwareError):
+class FirmwareTimeoutError(FirmwareError):
     """Raised when the firmware runs but does not answer."""
 
 
@@ -58,7 +58,7 @@ class Sitl:
             NamespaceError: no network namespace is available.
             CliError: the configuration is refused, or differs from what is read back.
         """
-        self._program, self._configuration = firmware.found(), configuration
+        self._program, self._configuration = firmware.find_program(), configuration
         self._running: IsolatedProgram | None = None
         self.time = 0.0
         remove_orphans()
@@ -102,7 +102,7 @@ class Sitl:
                 if running.process.poll() is not None:
                     raise FirmwareError(f"Betaflight's firmware ended at its start, code {running.process.returncode}") from None
                 if time.monotonic() > last:
-                    raise Frozen(f"Betaflight's firmware does not open its port {SERIAL} within {_START:g} s") from None
+                    raise FirmwareTimeoutError(f"Betaflight's firmware does not open its port {SERIAL} within {_START:g} s") from None
                 time.sleep(0.01)
 
     # -- cycles ------------------------------------------------------------------------------------------------------
@@ -120,7 +120,7 @@ class Sitl:
             Motors 0..1: front left, rear left, rear right, front right.
 
         Raises:
-            Frozen: the firmware does not answer.
+            FirmwareTimeoutError: the firmware does not answer.
         """
         self.time += CYCLE
         running = self._firmware
@@ -134,7 +134,7 @@ class Sitl:
         try:
             motors = _MOTORS.unpack_from(running.received.recv(64))
         except TimeoutError:
-            raise Frozen(f"Betaflight's firmware has not answered for {_ANSWER:g} s at {self.time:.3f} s") from None
+            raise FirmwareTimeoutError(f"Betaflight's firmware has not answered for {_ANSWER:g} s at {self.time:.3f} s") from None
         return tuple(min(max(motors[n], 0.0), 1.0) for n in _FROM_PACKET)
 
     @property
@@ -170,7 +170,7 @@ class Sitl:
         while time.monotonic() < last:
             for frame in parser.feed(self.receive(0.1)):
                 return msp.status(frame)
-        raise Frozen("Betaflight's firmware does not answer MSP")
+        raise FirmwareTimeoutError("Betaflight's firmware does not answer MSP")
 
     def close(self) -> None:
         """End the firmware."""
@@ -187,4 +187,4 @@ def remove_orphans() -> None:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-__all__ = ["CliError", "Frozen", "Sitl"]
+__all__ = ["CliError", "FirmwareTimeoutError", "Sitl"]

@@ -86,8 +86,8 @@ class LinkSupervisor:
                 self._link = Link(self._address)
             except LinkError:
                 return
-        if self._watchdog.begun:
-            self._send(msp.channels(channels) + (msp.request(msp.ATTITUDE) if self._watchdog.levels(now) else b""))
+        if self._watchdog.command_received:
+            self._send(msp.channels(channels) + (msp.request(msp.ATTITUDE) if self._watchdog.needs_attitude(now) else b""))
 
     def _send(self, data: bytes) -> None:
         try:
@@ -117,7 +117,7 @@ class LinkSupervisor:
         elif packet[:1] == b"H" and len(packet) == 1 + THROTTLES.size:
             self._watchdog.set_throttles(*THROTTLES.unpack_from(packet, 1))
         elif packet == b"T":
-            self._watchdog.turning()
+            self._watchdog.report_motors_turning()
 
     def _forward(self, link: Link) -> None:
         try:
@@ -155,14 +155,14 @@ class SupervisedLink:
         words = (theirs.fileno(), hover, descent, disarm_after, *(value for curve in curves for value in astuple(curve)))
         self.process = subprocess.Popen([sys.executable, "-m", "perch_autopilot.supervised_link", address, *map(str, words)],
                                         pass_fds=passed, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
-                                        cwd=Path(__file__).parents[1], start_new_session=True)  # a Ctrl-C is not for it
+                                        cwd=Path(__file__).parents[1], start_new_session=True)  # not interrupted by Ctrl-C
         theirs.close()
         self._control.settimeout(20.0)
         try:
-            begun = self._control.recv(64)
+            ready_message = self._control.recv(64)
         except OSError:
-            begun = b""
-        if begun != b"M":
+            ready_message = b""
+        if ready_message != b"M":
             self._control.close()
             output = self.process.communicate(timeout=5.0)[1].decode(errors="replace").strip().splitlines()
             raise LinkError(output[-1] if output else f"{address}: the process that holds the link does not start")
@@ -182,12 +182,12 @@ class SupervisedLink:
         """Send bytes to the autopilot in addition to the commands."""
         self._send(b"R" + data)
 
-    def turning(self) -> None:
+    def report_motors_turning(self) -> None:
         """Report that the motors turn already, before the first command."""
         self._send(b"T")
 
     def _send(self, packet: bytes) -> None:
-        with suppress(OSError):  # it is busy, or it has ended: `receive` says so
+        with suppress(OSError):  # it is busy, or it has ended, which `receive` reports
             self._control.send(packet)
 
     def receive(self, timeout: float = 0.0) -> tuple[bytes, list[str]]:
@@ -217,7 +217,7 @@ class SupervisedLink:
 
 
 def main() -> None:
-    """Run the supervisor: address, file number, hover, descent, disarm_after; centre, most, expo of roll's and pitch's curve."""
+    """Run the supervisor: address, file number, hover, descent, disarm_after; centre, maximum, expo of roll's and pitch's curve."""
     address, number, hover, descent, disarm_after, *rest = sys.argv[1:]
     roll, pitch = (RateCurve(*map(float, rest[k:k + 3])) for k in (0, 3))
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

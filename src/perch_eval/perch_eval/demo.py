@@ -77,7 +77,7 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
     with uncompiled():
         check_flight(scenario, source)
     if load_vehicle(scenario.vehicle).actuation.firmware:
-        firmware.ensured()
+        firmware.ensure_program()
     if not 0 <= seed < 2**31:
         raise ConfigError("--seed", str(seed), "is outside [0, 2147483647]")
     on_line = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)

@@ -27,7 +27,7 @@ from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotio
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.ukf import Estimate, UkfConfig
 from perch_perception.vio import VioPoseEstimate, VioResult
-from perch_perception.vio.start import TOLD_SIGMA
+from perch_perception.vio.start import CONFIGURED_POSE_SIGMA
 from perch_perception.vio_component import VioComponent, VioComponentConfig
 from perch_sim.calibration import true_imu, true_mount
 from perch_sim.lockstep import Task
@@ -114,7 +114,7 @@ def sensor_data(motion: TrueMotion, scene: Scene, scenario: Scenario, seed: int)
         image = renderer.render(list(zip(poses.p_WB, poses.R_WB)), np.random.default_rng([seed, round(middle * 1e6)]))
         frames.append((float(middle), round((middle + real.stamp_offset) * 1e9), image))
     # The start pose is as accurate as its covariance states: a covariance cannot be judged on an error that was never made.
-    start_error = np.random.default_rng([seed, 9]).standard_normal(4) * TOLD_SIGMA
+    start_error = np.random.default_rng([seed, 9]).standard_normal(4) * CONFIGURED_POSE_SIGMA
     return Flight(motion, truth, read_imu(truth, true_imu(vehicle.imu, seed), rng), mount, tuple(frames), start_error, scenario.vehicle)
 
 

@@ -70,9 +70,9 @@ class TruthLocalizer(TargetLocalizer):
         super().on_camera_info(model)
         self.on_image(CameraImage(model.stamp, model.frame, model.camera.width, model.camera.height, "mono8", lambda *_: None))
 
-    def covers(self, image: CameraImage) -> bool:
+    def is_ready(self, image: CameraImage) -> bool:
         """As in the base class, and additionally whether the truth has passed the exposure."""
-        return super().covers(image) and self._sight.middle(self._exposed(image)) <= self._newest
+        return super().is_ready(image) and self._sight.middle(self._exposure_time(image)) <= self._newest
 
 
 TARGET_LOCALIZER = node("target_localizer", TruthLocalizer)

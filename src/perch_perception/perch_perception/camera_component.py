@@ -22,8 +22,8 @@ from perch_perception.sensor_file import camera_mounts
 from perch_perception.stamp_guard import StampGuard, StampVerdict
 from perch_perception.world_frames import is_world
 
-MOST_WAITING = 10   # images; the oldest gives way to more
-FUTURE = 0.5        # an image stamped this much ahead of the odometry cannot be right [s]
+MAX_QUEUED = 10       # images; beyond that the oldest is dropped
+MAX_STAMP_LEAD = 0.5  # an image whose stamp is further ahead of the odometry is refused [s]
 
 
 class CameraConfig(Protocol):
@@ -72,15 +72,15 @@ class CameraComponent(Component[C], ABC):
         mounts = camera_mounts(config.sensors)
         self._calibrated = bool(mounts)
         mounts = mounts or load_vehicle(config.vehicle).mounts
-        usable = [camera for camera, mount in mounts.items() if self.unusable(mount) == ""]
+        usable = [camera for camera, mount in mounts.items() if self.rejection_reason(mount) == ""]
         if config.camera not in usable:
             mount = mounts.get(config.camera)
-            why = "not there" if mount is None else self.unusable(mount)
+            why = "not there" if mount is None else self.rejection_reason(mount)
             raise ConfigError(type(self).__name__, "camera",
                               f"{config.camera!r} of {config.sensors if self._calibrated else config.vehicle} is {why}; usable: {', '.join(usable) or 'none'}")
         self.mounted = MountedCamera(mounts[config.camera], config.extrinsics, self.warn)
         self.dropped = 0
-        self._waiting: deque[CameraImage] = deque()
+        self._queue: deque[CameraImage] = deque()
         self._topic = self._channel("image")
 
     def warm_up(self) -> None:
@@ -89,7 +89,7 @@ class CameraComponent(Component[C], ABC):
         rays = camera.unproject(np.zeros((1, 2)))
         camera.project(rays), camera.project_jacobian(rays)
 
-    def unusable(self, mount: CameraMount) -> str:
+    def rejection_reason(self, mount: CameraMount) -> str:
         """Return the reason why this component cannot use a camera; empty where it can."""
         return ""
 
@@ -98,7 +98,7 @@ class CameraComponent(Component[C], ABC):
         """Called when the camera has become known or has changed."""
 
     @abstractmethod
-    def covers(self, image: CameraImage) -> bool:
+    def is_ready(self, image: CameraImage) -> bool:
         """Whether all data that an image requires have been received, or cannot be expected any more."""
 
     @abstractmethod
@@ -123,29 +123,29 @@ class CameraComponent(Component[C], ABC):
         """Queue an image, and use all images that can be used."""
         if self._calibrated and self.mounted.mount is None:
             self.on_camera_info(CameraModel(image.stamp, image.frame, self.mounted.nominal.camera))
-        self._waiting.append(image)
-        if len(self._waiting) > MOST_WAITING:
-            self._waiting.popleft()
+        self._queue.append(image)
+        if len(self._queue) > MAX_QUEUED:
+            self._queue.popleft()
             self.dropped += 1
-            self.warn(f"{self._topic}: more than {MOST_WAITING} images wait: the oldest are dropped", 1.0)
+            self.warn(f"{self._topic}: more than {MAX_QUEUED} images are waiting: the oldest are dropped", 1.0)
         if self.mounted.missing:
             self.warn(f"{self._topic}: images are not used: {self.mounted.missing}", 1.0)
         self.advance()
 
     def advance(self) -> None:
         """Use the queued images that are covered."""
-        while self._waiting and self.mounted.mount is not None and self.covers(self._waiting[0]):
-            self.use(self._waiting.popleft())
+        while self._queue and self.mounted.mount is not None and self.is_ready(self._queue[0]):
+            self.use(self._queue.popleft())
 
-    def forget_images(self) -> None:
+    def clear_queue(self) -> None:
         """Drop all queued images, e.g. after a restart of their data source."""
-        self._waiting.clear()
+        self._queue.clear()
 
     def _channel(self, port: str) -> str:
         return getattr(type(self), port).channel(self)
 
 
-class LocatedCameraComponent(CameraComponent[C]):
+class PosedCameraComponent(CameraComponent[C]):
     """Camera component that uses an image once the odometry has passed its exposure.
 
     Image and odometry arrive on different topics, in an order that depends on the machine. As an image is processed only once the
@@ -164,55 +164,55 @@ class LocatedCameraComponent(CameraComponent[C]):
         self._last = -math.inf  # exposure of the last image used
 
     @abstractmethod
-    def look(self, image: CameraImage, exposed: float) -> None:
+    def process_image(self, image: CameraImage, exposure_time: float) -> None:
         """Use one image.
 
         Args:
             image: its pixels are rendered or decoded on access.
-            exposed: middle of its exposure on the IMU's clock [s].
+            exposure_time: middle of its exposure on the IMU's clock [s].
         """
 
-    def refuse(self, image: CameraImage, exposed: float, reason: str) -> None:
+    def refuse(self, image: CameraImage, exposure_time: float, reason: str) -> None:
         """Report that an image cannot be used."""
         self.warn(f"{self._topic}: {reason}", 1.0)
 
     def restart(self) -> None:
         """Discard all states and images after a restart of the odometry."""
         self._begin()
-        self.forget_images()
+        self.clear_queue()
 
     def on_odometry(self, state: OdometryState) -> None:
         """Store the vehicle's state, and use the images that it covers."""
         if not is_world(state.frame):
-            self.warn(f"odometry: frame {state.frame!r} is no fixed frame known here: not used", 1.0)
+            self.warn(f"odometry: frame {state.frame!r} is not a known fixed frame: ignored", 1.0)
             return
-        verdict = self._guard.judge(state.stamp)
+        verdict = self._guard.check(state.stamp)
         if verdict is StampVerdict.REFUSED:
             self.warn(f"odometry: stamp {state.stamp} ns does not follow {self._guard.last} ns: not used", 1.0)
             return
         if verdict is StampVerdict.RESTARTED:
-            self.warn(f"odometry: stamps go on from {state.stamp} ns: starting anew")
+            self.warn(f"odometry: stamp jump to {state.stamp} ns: restarting")
             self.restart()
         self.bodies.add(BodyState(seconds(state.stamp), np.array(state.p_WB), np.array(state.q_WB), np.array(state.v_WB),
                                   np.array(state.w_B), state.pose_covariance))
-        if self._waiting:
+        if self._queue:
             self.advance()
 
-    def covers(self, image: CameraImage) -> bool:
+    def is_ready(self, image: CameraImage) -> bool:
         """Whether the odometry has passed the image's exposure, or the image must be refused."""
-        exposed, newest = self._exposed(image), self.bodies.newest
-        return exposed <= self._last or exposed <= newest or math.isfinite(newest) and exposed > newest + FUTURE
+        exposure_time, newest = self._exposure_time(image), self.bodies.newest
+        return exposure_time <= self._last or exposure_time <= newest or math.isfinite(newest) and exposure_time > newest + MAX_STAMP_LEAD
 
     def use(self, image: CameraImage) -> None:
         """Process an image, or refuse it where it is not newer than the last or is ahead of the odometry."""
-        exposed, newest = self._exposed(image), self.bodies.newest
-        if exposed <= self._last:
-            self.refuse(image, exposed, f"image stamp {exposed:.4f} s is not newer than the last, {self._last:.4f} s")
-        elif exposed > newest:
-            self.refuse(image, exposed, f"image stamp {exposed:.4f} s is {exposed - newest:.2f} s ahead of the odometry")
+        exposure_time, newest = self._exposure_time(image), self.bodies.newest
+        if exposure_time <= self._last:
+            self.refuse(image, exposure_time, f"image stamp {exposure_time:.4f} s is not newer than the last, {self._last:.4f} s")
+        elif exposure_time > newest:
+            self.refuse(image, exposure_time, f"image stamp {exposure_time:.4f} s is {exposure_time - newest:.2f} s ahead of the odometry")
         else:
-            self._last = exposed
-            self.look(image, exposed)
+            self._last = exposure_time
+            self.process_image(image, exposure_time)
 
-    def _exposed(self, image: CameraImage) -> float:
+    def _exposure_time(self, image: CameraImage) -> float:
         return round(seconds(image.stamp) - self.mounted.nominal.stamp_offset, 9)

@@ -23,8 +23,8 @@ from perch_perception.world_frames import MAP, is_world
 STATUS_PERIOD = 100_000_000        # [ns]
 DIAGNOSTICS_PERIOD = 1_000_000_000
 DIAGNOSTICS_PHASE = 334_000_000    # not with the status
-STATES_LAST = 1_000_000_000        # time after VIO's last whole state in which its odometry is ignored [ns]
-MOST_UNUSED = 20                   # measurements that wait for the next IMU sample
+STATE_VALIDITY = 1_000_000_000     # time after VIO's last whole state in which its odometry is ignored [ns]
+MAX_PENDING = 20                   # measurements that wait for the next IMU sample
 _NEVER = -(1 << 62)
 V = TypeVar("V", InertialState, OdometryState)
 
@@ -52,7 +52,7 @@ class StateEstimator(Component[EstimatorConfig]):
     def _begin(self) -> None:
         """Reset to the state before the first sample."""
         self._estimator = Estimator(self.config)
-        self._unused: list[tuple[int, bool, VioPose]] = []  # (stamp, odometry rather than a state, what it says)
+        self._pending: list[tuple[int, bool, VioPose]] = []  # (stamp, odometry rather than a state, pose)
         self._newest_state = _NEVER
         self._covariances = (np.zeros((6, 6)), np.zeros((6, 6)))
         self._covariance_age = COVARIANCE_STRIDE  # IMU samples since they were computed
@@ -65,11 +65,11 @@ class StateEstimator(Component[EstimatorConfig]):
 
     def on_vio_state(self, state: InertialState) -> None:
         """Keep VIO's state for the next IMU sample."""
-        self._keep("vio/state", state, state_of)
+        self._queue_measurement("vio/state", state, state_of)
 
     def on_vio_odometry(self, odometry: OdometryState) -> None:
         """Keep VIO's odometry for the next IMU sample."""
-        self._keep("vio/odometry", odometry, pose_of)
+        self._queue_measurement("vio/odometry", odometry, pose_of)
 
     def on_imu(self, sample: ImuSample) -> None:
         """Apply the pending VIO measurements, propagate the state to the sample's stamp, and publish it."""
@@ -78,7 +78,7 @@ class StateEstimator(Component[EstimatorConfig]):
             return
         if self._intake.restarted:
             self._begin()
-        if self._unused:
+        if self._pending:
             self._use_vio()
         outcome = self._estimator.add_imu(taken)
         if not outcome.used:
@@ -98,26 +98,26 @@ class StateEstimator(Component[EstimatorConfig]):
             self._diagnoses = (since - DIAGNOSTICS_PHASE) // DIAGNOSTICS_PERIOD + 1
             self._diagnose(sample.stamp)
 
-    def _keep(self, channel: str, value: V, read: Callable[[V], VioPose]) -> None:
+    def _queue_measurement(self, channel: str, value: V, read: Callable[[V], VioPose]) -> None:
         """Check and convert a measurement, and store it for the next IMU sample."""
         if not is_world(value.frame):
-            self.warn(f"{channel}: frame {value.frame!r} is no fixed frame known here: not used", 1.0)
+            self.warn(f"{channel}: frame {value.frame!r} is not a known fixed frame: ignored", 1.0)
             return
         try:
             pose = read(value)
         except (PerchError, TypeError, ValueError) as error:
             self.warn(f"{channel}: {error}: not used", 1.0)
             return
-        if len(self._unused) >= MOST_UNUSED:
-            self.warn(f"{channel}: more than {MOST_UNUSED} values without an IMU sample: the oldest are dropped", 1.0)
-            self._unused.pop(0)
-        self._unused.append((pose.stamp, pose.inertial is None, pose))
+        if len(self._pending) >= MAX_PENDING:
+            self.warn(f"{channel}: more than {MAX_PENDING} values without an IMU sample: the oldest are dropped", 1.0)
+            self._pending.pop(0)
+        self._pending.append((pose.stamp, pose.inertial is None, pose))
 
     def _use_vio(self) -> None:
         """Apply the stored measurements in the order of their stamps; at the same stamp, the state precedes the odometry."""
-        unused, self._unused = sorted(self._unused, key=lambda entry: entry[:2]), []
-        for stamp, is_odometry, pose in unused:
-            if is_odometry and stamp <= self._newest_state + STATES_LAST:
+        pending, self._pending = sorted(self._pending, key=lambda entry: entry[:2]), []
+        for stamp, is_odometry, pose in pending:
+            if is_odometry and stamp <= self._newest_state + STATE_VALIDITY:
                 continue
             outcome = self._estimator.add_vio(pose)
             if not is_odometry and (outcome.used or outcome is VioOutcome.DUPLICATE):

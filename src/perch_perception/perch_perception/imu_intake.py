@@ -30,12 +30,12 @@ class ImuIntake:
         taken = self.axes.in_body(sample)
         if taken is None:
             return None
-        verdict = self._guard.judge(sample.stamp)
+        verdict = self._guard.check(sample.stamp)
         if verdict is StampVerdict.GOOD:
             return taken
         if verdict is StampVerdict.REFUSED:
             self._warn(f"imu/data_raw: stamp {sample.stamp} ns does not follow {self._guard.last} ns: not used", 1.0)
             return None
-        self._warn(f"imu/data_raw: stamps go on from {sample.stamp} ns: starting anew", 0.0)
+        self._warn(f"imu/data_raw: stamp jump to {sample.stamp} ns: restarting", 0.0)
         self.restarted = True
         return taken

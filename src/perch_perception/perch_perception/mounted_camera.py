@@ -12,7 +12,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.values import CameraModel, Transform
 from perch_core.static_transforms import BASE, StaticTransforms
 
-CONFIRMATIONS = 5  # camera_info in a row with other intrinsics, after which they are believed to have changed
+CONFIRMATIONS = 5  # camera_info in a row with other intrinsics, after which the change is accepted
 
 
 class MountedCamera:
@@ -35,7 +35,7 @@ class MountedCamera:
         self._camera: Camera | None = None
         self._frame, self._topic = "", f"camera_{nominal.name}/camera_info"
         self._other: Camera | None = None
-        self._others = 0
+        self._other_count = 0
 
     @property
     def known(self) -> CameraMount:
@@ -48,13 +48,13 @@ class MountedCamera:
         """Description of what is not known yet; empty once the camera is known."""
         if self.mount is not None:
             return ""
-        return f"no {self._topic} yet" if self._camera is None else f"/tf_static does not say yet where {self._frame!r} is in {BASE}"
+        return f"no {self._topic} yet" if self._camera is None else f"no transform of {self._frame!r} in {BASE} on /tf_static yet"
 
     def take_model(self, model: CameraModel) -> bool:
         """Take the camera's intrinsics; return whether `mount` has changed."""
         camera = model.camera
         if camera is self._camera or camera == self._camera:
-            self._others = 0
+            self._other_count = 0
             if self._by_transforms and model.frame != self._frame:
                 self._frame = model.frame
                 return self._place()
@@ -62,7 +62,7 @@ class MountedCamera:
         if self._camera is not None and not self._is_confirmed(camera):
             return False
         self._camera = self.nominal.camera if camera == self.nominal.camera else camera
-        self._frame, self._others = model.frame, 0
+        self._frame, self._other_count = model.frame, 0
         return self._place()
 
     def take_transform(self, transform: Transform) -> bool:
@@ -74,10 +74,10 @@ class MountedCamera:
 
     def _is_confirmed(self, camera: Camera) -> bool:
         """Whether other intrinsics were received often enough in a row; a single message of another camera is ignored."""
-        self._others = self._others + 1 if camera == self._other else 1
+        self._other_count = self._other_count + 1 if camera == self._other else 1
         self._other = camera
-        if self._others < CONFIRMATIONS:
-            self._warn(f"{self._topic}: differs from what it was: not used before {CONFIRMATIONS} in a row agree", 1.0)
+        if self._other_count < CONFIRMATIONS:
+            self._warn(f"{self._topic}: intrinsics changed: not used until {CONFIRMATIONS} consecutive messages agree", 1.0)
             return False
         self._warn(f"{self._topic}: the camera has changed", 0.0)
         return True

@@ -95,8 +95,8 @@ class PoseBuffer:
             StampError: no states yet, older than the history, newer than the newest state, in a gap, or an invalid covariance.
         """
         state = self._at(time)
-        if said := _COVARIANCE.problem(state.covariance):
-            raise StampError(f"stamp {time:.4f} s: the odometry's covariance {said}")
+        if problem := _COVARIANCE.problem(state.covariance):
+            raise StampError(f"stamp {time:.4f} s: the odometry's covariance {problem}")
         return state
 
     def _at(self, time: float) -> BodyState:
@@ -106,7 +106,7 @@ class PoseBuffer:
         if time > newest:
             raise StampError(f"stamp {time:.4f} s is {1e3 * (time - newest):.1f} ms ahead of the odometry")
         if time < oldest:
-            raise StampError(f"stamp {time:.4f} s is {1e3 * (oldest - time):.1f} ms older than the odometry kept")
+            raise StampError(f"stamp {time:.4f} s is {1e3 * (oldest - time):.1f} ms older than the stored odometry")
         right = bisect_left(self._times, time)
         if self._times[right] == time:
             return replace(self._states[right], corrected=self._corrected[right])

@@ -16,7 +16,7 @@ from perch_core.covariance import largest_sigma
 from perch_core.sensors import CalibrationSigmas
 from perch_core.tag_board import load_board
 from perch_core.values import CameraImage, TargetPose, TargetSighting, nanoseconds
-from perch_perception.camera_component import LocatedCameraComponent, extrinsics_parameter, images_parameter
+from perch_perception.camera_component import PosedCameraComponent, extrinsics_parameter, images_parameter
 from perch_perception.images import ImageError, check_image, mono_image
 from perch_perception.pose_buffer import BodyState, StampError
 from perch_perception.sensor_file import calibration_sigmas, sensors_parameter
@@ -50,17 +50,17 @@ class TargetLocalizerConfig:
 class Localizer(Protocol):
     """Finds the board in an image: `BoardLocalizer`, or an error model in its place."""
 
-    def process(self, image: Callable[[Region | None], np.ndarray], exposed: float, body: BodyState | None) -> Localization:
+    def process(self, image: Callable[[Region | None], np.ndarray], exposure_time: float, body: BodyState | None) -> Localization:
         """Localise the board.
 
         Args:
             image: returns the grey image, uint8 (height, width), in which the requested region is valid; None: the whole image.
-            exposed: middle of its exposure [s].
-            body: state of the vehicle at `exposed`, where it is known.
+            exposure_time: middle of its exposure [s].
+            body: state of the vehicle at `exposure_time`, where it is known.
         """
 
 
-class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
+class TargetLocalizer(PosedCameraComponent[TargetLocalizerConfig]):
     """Publishes `sighting` for every image, and `pose` whenever a new estimate of the target is accurate enough."""
 
     config_type = TargetLocalizerConfig
@@ -79,15 +79,15 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
         """
         super().__init__(replace(config, calibration=calibration_sigmas(config.sensors, config.camera, config.calibration)))
         self._board = load_board(config.board)
-        self._given, self._localizer = localizer, localizer
+        self._injected_localizer, self._localizer = localizer, localizer
         self._averaged: MapPose | None = None  # by the first complete image
         self._fused: FusedTarget | None = None
         self._counts = {"images": 0, "found": 0, "complete": 0}
-        self._diagnosed = -np.inf
+        self._last_diagnostics = -np.inf
 
     def use_camera(self, mount: CameraMount) -> None:
         """Create a localiser for the camera, unless one was given."""
-        if self._given is None:
+        if self._injected_localizer is None:
             self._localizer = BoardLocalizer(self._board, mount, self.config.max_range, averaging=self.config.mode == "average",
                                              calibration=self.config.calibration)
 
@@ -98,11 +98,11 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
         if self.mounted.mount is not None:
             self.use_camera(self.mounted.mount)
 
-    def look(self, image: CameraImage, exposed: float) -> None:
+    def process_image(self, image: CameraImage, exposure_time: float) -> None:
         """Localise the board in one image, and publish the result."""
         body, problem = None, ""
         try:
-            body = self.bodies.at(exposed)
+            body = self.bodies.at(exposure_time)
         except StampError as error:
             problem = str(error)
         camera, localizer = self.mounted.known.camera, self._localizer
@@ -113,19 +113,19 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
 
         try:
             check_image(image, camera)
-            result = localizer.process(pixels, exposed, body)
+            result = localizer.process(pixels, exposure_time, body)
         except ImageError as error:
             result = Localization(None, message=str(error))
             self.warn(f"{self._topic}: {error}", 1.0)
-        self._tell(result, body, exposed, problem)
+        self._publish_sighting(result, body, exposure_time, problem)
 
-    def refuse(self, image: CameraImage, exposed: float, reason: str) -> None:
+    def refuse(self, image: CameraImage, exposure_time: float, reason: str) -> None:
         """Publish an empty sighting with the reason."""
-        super().refuse(image, exposed, reason)
-        self._tell(Localization(None, message=reason), None, exposed, "")
+        super().refuse(image, exposure_time, reason)
+        self._publish_sighting(Localization(None, message=reason), None, exposure_time, "")
 
-    def _tell(self, result: Localization, body: BodyState | None, exposed: float, problem: str) -> None:
-        stamp = nanoseconds(exposed)
+    def _publish_sighting(self, result: Localization, body: BodyState | None, exposure_time: float, problem: str) -> None:
+        stamp = nanoseconds(exposure_time)
         self._counts["images"] += 1
         message = "; ".join(part for part in (result.message, problem if result.board is not None else "") if part)
         sighting = TargetSighting(stamp, False, None, None, (), 0.0, 0, self.config.mode, message)
@@ -138,8 +138,8 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
                 self._counts["found"] += 1
                 sighting = self._update(result.board, result.average, body, sighting)
         self.sighting(sighting)
-        if exposed - self._diagnosed >= DIAGNOSTICS_PERIOD or exposed < self._diagnosed:
-            self._diagnosed = exposed
+        if exposure_time - self._last_diagnostics >= DIAGNOSTICS_PERIOD or exposure_time < self._last_diagnostics:
+            self._last_diagnostics = exposure_time
             self.diagnostics(Diagnostics(stamp, {**self._counts, "dropped": self.dropped, "mode": self.config.mode},
                                          1 if message else 0, message or "ok"))
 
@@ -147,30 +147,30 @@ class TargetLocalizer(LocatedCameraComponent[TargetLocalizerConfig]):
         """Update the target by the mode, and publish its pose where it is accurate enough."""
         measured = to_map(average or board, body, self.mounted.known, self.config.calibration)
         target: FusedTarget | MapPose = measured
-        fresh, frames, method = True, 1, self.config.mode
+        is_new, frames, method = True, 1, self.config.mode
         if method == "fused":
             self._fuse(measured)
             if self._fused is not None:
                 target, frames = self._fused, self._fused.frames
         elif method == "average":
-            fresh = self._averaged is None and average is not None and self._good(measured.covariance)  # the first good complete image, once
-            if fresh:
+            is_new = self._averaged is None and average is not None and self._is_accurate(measured.covariance)  # the first good complete image, once
+            if is_new:
                 self._averaged = measured
             elif self._averaged is None:
                 method = "joint"  # not all tags yet: this is no average
             target = self._averaged or measured
         pose = _pose(sighting.stamp, target.p_WS, target.R_WS, target.covariance)
-        if fresh and self._good(target.covariance):
+        if is_new and self._is_accurate(target.covariance):
             self.pose(pose)
         return sighting._replace(found=True, pose=pose, frames_fused=frames, method=method)
 
     def _fuse(self, measured: MapPose) -> None:
         if self._fused is not None:
             self._fused = fuse(self._fused, measured)
-        elif self._good(measured.covariance):
+        elif self._is_accurate(measured.covariance):
             self._fused = start_fusion(measured)
 
-    def _good(self, covariance: np.ndarray) -> bool:
+    def _is_accurate(self, covariance: np.ndarray) -> bool:
         """Whether the worst axes of position and attitude are known within the limits."""
         position, attitude = largest_sigma(covariance[:3, :3]), largest_sigma(covariance[3:, 3:])
         return bool(position <= self.config.max_position_sigma and attitude <= np.radians(self.config.max_attitude_sigma))

@@ -88,14 +88,14 @@ class VioComponent(CameraComponent[VioComponentConfig]):
             return
         if self._intake.restarted:
             self._begin()
-            self.forget_images()
+            self.clear_queue()
         outcome = self._vio.add_imu(taken)
         if not outcome.used:
             self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
-        if self._waiting:
+        if self._queue:
             self.advance()
 
-    def covers(self, image: CameraImage) -> bool:
+    def is_ready(self, image: CameraImage) -> bool:
         """Whether the IMU has passed the image's exposure, or its stamp is too far ahead to wait for."""
         return self._vio.covers(image.stamp)
 

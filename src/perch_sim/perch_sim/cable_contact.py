@@ -39,7 +39,7 @@ class CableLine:
     def __init__(self, cable: Cable) -> None:
         # the sagitta of an arc: pieces so short that none is further than MAX_ERROR from the cable
         pieces = math.ceil(math.sqrt(max(1.0, cable.sag / MAX_ERROR)))
-        points = cable.hanging().sample(pieces + 1)
+        points = cable.catenary().sample(pieces + 1)
         self._start, chord = points[:-1], np.diff(points, axis=0)
         self._length = np.linalg.norm(chord, axis=1)
         self._direction = chord / self._length[:, None]
@@ -89,7 +89,7 @@ class CableMonitor:
         self._reach = float(self._radii.max())
         self._nearest: list[Contact | None] = [None] * len(cables)  # of this pass
         self._attachment: Attachment | None = None
-        self._open = False  # let go, and not yet out of reach of what was held
+        self._open = False  # released, and the cable is still within reach
         self.hold: Hold = FREE
         self.crashed = False
 
@@ -146,8 +146,8 @@ class CableMonitor:
             self._attachment = Attachment(time, -1, gripper_W, near.point_W, x[3:7], square / np.linalg.norm(square), np.zeros(3))
             self.hold, self._nearest[k] = self._attachment.hold(time), None
             return [event._replace(state=ContactState.ATTACHED)]
-        known = self._nearest[k]
-        if refusal and (known is None or near.distance < known.offset):
+        previous = self._nearest[k]
+        if refusal and (previous is None or near.distance < previous.offset):
             self._nearest[k] = event._replace(reason=refusal)
         return []
 

@@ -112,14 +112,14 @@ class ContactMonitor:
         return events
 
     def _touch(self, time: float, s: int, before: np.ndarray, x: np.ndarray, rest: bool, speed: float) -> Contact | None:
-        known, breaks = self._touched.get(s), speed > CRASH_SPEED and not self.crashed
-        if known is not None and not breaks and (known[1] is ContactState.COLLISION or not rest):
-            self._touched[s] = (time, known[1])
+        previous, crashes = self._touched.get(s), speed > CRASH_SPEED and not self.crashed
+        if previous is not None and not crashes and (previous[1] is ContactState.COLLISION or not rest):
+            self._touched[s] = (time, previous[1])
             return None
         surfaces = self._obstacles.surfaces
         p_WS = surfaces.origin[s] + surfaces.velocity[s] * time
         impact = impact_of(before, self._plate_offset, p_WS, surfaces.axes[s], surfaces.velocity[s])
-        state, reason = self._judge(s, impact, rest, speed)
+        state, reason = self._classify(s, impact, rest, speed)
         self._touched[s] = (time, state)
         if state is ContactState.ATTACHED:
             self._attach(time, s, x, p_WS)
@@ -127,12 +127,12 @@ class ContactMonitor:
         return Contact(0, state, self._obstacles.names[s], impact.normal_speed, impact.tangential_speed,
                        impact.tilt_error, offset, reason)
 
-    def _judge(self, s: int, impact: Impact, rest: bool, speed: float) -> tuple[ContactState, str]:
+    def _classify(self, s: int, impact: Impact, rest: bool, speed: float) -> tuple[ContactState, str]:
         """Classify a touch, and record a crash; `speed` is that of its fastest point into the surface [m/s]."""
         name, fast = self._obstacles.names[s], speed > CRASH_SPEED
         too_fast = f"hit the {name} with {speed:.2f} m/s, above {CRASH_SPEED:g} m/s"
         if self.crashed:
-            return ContactState.COLLISION, f"the wreck touched the {name}"
+            return ContactState.COLLISION, f"touched the {name} after the crash"
         if name == "floor":
             self.crashed = rest or fast or impact.tilt_error > LANDING_TILT
             if not self.crashed:

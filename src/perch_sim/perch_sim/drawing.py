@@ -19,16 +19,16 @@ from perch_core.camera import Region
 from perch_core.camera_mount import CameraMount
 from perch_core.vehicle import load_vehicle
 from perch_sim.calibration import true_mounts
-from perch_sim.drawing_process import GREETING
+from perch_sim.drawing_process import READY_MESSAGE
 from perch_sim.rendering import Pose, Renderer, Scene, build_scene
 from perch_sim.scenario import Scenario
 
-Exposure = Callable[[], tuple[Sequence[Pose], np.random.Generator, np.ndarray]]  # what `Renderer.render` takes, worked out when it is drawn
+Exposure = Callable[[], tuple[Sequence[Pose], np.random.Generator, np.ndarray]]  # the arguments of `Renderer.render`, computed on rendering
 COMMAND = (sys.executable, "-m", "perch_sim.drawing_process")
 PIPE_SIZE = 1 << 20  # holds an image, so that neither end waits for the other [B]
 
 
-class ImageToCome(Protocol):
+class PendingImage(Protocol):
     """An image that is being rendered.
 
     Attributes:
@@ -48,12 +48,12 @@ class ImageToCome(Protocol):
         """
 
 
-class Drawing(Protocol):
+class Rendering(Protocol):
     """Renders the images of some cameras."""
 
     cameras: tuple[str, ...]
 
-    def draw(self, camera: str, exposure: Exposure) -> ImageToCome:
+    def draw(self, camera: str, exposure: Exposure) -> PendingImage:
         """Begin to render the image of one exposure, by `Renderer.render` of that camera."""
 
     def ready(self) -> bool:
@@ -63,7 +63,7 @@ class Drawing(Protocol):
         """End the rendering processes, if any."""
 
 
-class DrawnOnDemand:
+class OnDemandRendering:
     """Renders images in this process when they are read; images that are not read are never rendered.
 
     A thread would not be faster where every core runs a flight of its own, and rendering and flight would wait for each
@@ -79,18 +79,18 @@ class DrawnOnDemand:
         """
         self.cameras = tuple(cameras)
         self._scenario, self._seed = scenario, seed
-        self._seen: dict[str, tuple[Scene, CameraMount]] = {}  # they share the scene, and with it its textures
+        self._scenes: dict[str, tuple[Scene, CameraMount]] = {}  # they share the scene, and with it its textures
         self._renderers: dict[str, Renderer] = {}
 
-    def draw(self, camera: str, exposure: Exposure) -> ImageToCome:
-        """As `Drawing.draw`."""
-        return _Undrawn(partial(self._render, camera, exposure))
+    def draw(self, camera: str, exposure: Exposure) -> PendingImage:
+        """As `Rendering.draw`."""
+        return _LazyImage(partial(self._render, camera, exposure))
 
     def _render(self, camera: str, exposure: Exposure, region: Region | None) -> np.ndarray:
-        if not self._seen:
-            self._seen = {name: (scene, mount) for name, scene, mount in _seen(self._scenario, self._seed, self.cameras)}
+        if not self._scenes:
+            self._scenes = {name: (scene, mount) for name, scene, mount in _camera_scenes(self._scenario, self._seed, self.cameras)}
         if camera not in self._renderers:
-            self._renderers[camera] = Renderer(*self._seen[camera], self._seed)
+            self._renderers[camera] = Renderer(*self._scenes[camera], self._seed)
         return self._renderers[camera].render(*exposure(), region=region)
 
     def ready(self) -> bool:
@@ -101,7 +101,7 @@ class DrawnOnDemand:
         """Do nothing: there are no processes."""
 
 
-class _Undrawn:
+class _LazyImage:
     on_demand = True
 
     def __init__(self, render: Callable[..., np.ndarray]) -> None:
@@ -117,7 +117,7 @@ class _Undrawn:
         return self._image
 
 
-class DrawnInProcesses:
+class ProcessRendering:
     """Renders images in one process per camera.
 
     A thread in the node's process requests the interpreter lock some fifty times per image, and waits each time until the
@@ -136,42 +136,42 @@ class DrawnInProcesses:
             ConfigError: the scenario's vehicle or board does not exist.
         """
         self.cameras = tuple(cameras)
-        self._draftsmen = {name: _Draftsman(scene, mount, seed) for name, scene, mount in _seen(scenario, seed, cameras)}
+        self._clients = {name: _RenderClient(scene, mount, seed) for name, scene, mount in _camera_scenes(scenario, seed, cameras)}
 
-    def draw(self, camera: str, exposure: Exposure) -> ImageToCome:
-        """As `Drawing.draw`."""
-        return self._draftsmen[camera].draw(exposure)
+    def draw(self, camera: str, exposure: Exposure) -> PendingImage:
+        """As `Rendering.draw`."""
+        return self._clients[camera].draw(exposure)
 
     def ready(self) -> bool:
         """Return whether every process has drawn its textures and rendered a first image, or has ended."""
-        return all(draftsman.ready() for draftsman in self._draftsmen.values())
+        return all(client.ready() for client in self._clients.values())
 
     def close(self) -> None:
         """End the processes."""
-        for draftsman in self._draftsmen.values():
-            draftsman.process.kill()
-        for draftsman in self._draftsmen.values():
-            draftsman.process.wait()
+        for client in self._clients.values():
+            client.process.kill()
+        for client in self._clients.values():
+            client.process.wait()
 
 
-class _Draftsman:
+class _RenderClient:
     """Client of a process that renders the images of one camera, in the order of the requests."""
 
     def __init__(self, scene: Scene, mount: CameraMount, seed: int) -> None:
-        orders, self._orders = Pipe(duplex=False)
+        requests, self._requests = Pipe(duplex=False)
         self._images, images = Pipe(duplex=False)
         with suppress(OSError, AttributeError):  # not Linux, or a smaller limit
             fcntl.fcntl(images.fileno(), fcntl.F_SETPIPE_SZ, PIPE_SIZE)
-        ends = (orders.fileno(), images.fileno())
-        self.process = subprocess.Popen([*COMMAND, *map(str, ends)], pass_fds=ends, process_group=0)  # Ctrl-C is the caller's matter
-        for end in (orders, images):
+        ends = (requests.fileno(), images.fileno())
+        self.process = subprocess.Popen([*COMMAND, *map(str, ends)], pass_fds=ends, process_group=0)  # Ctrl-C is handled by the caller
+        for end in (requests, images):
             end.close()  # so that the end of the process is the end of the pipe
-        with suppress(OSError):  # it has ended already, which the first order finds out
-            self._orders.send((scene, mount, seed))
+        with suppress(OSError):  # it has ended already: detected by the first request
+            self._requests.send((scene, mount, seed))
         self._poll = select.poll()  # Connection.poll makes one for every call, which takes 0.1 ms
         self._poll.register(self._images.fileno(), select.POLLIN)
         self._shape = (mount.camera.height, mount.camera.width, 3)[:3 if mount.colour else 2]
-        self._ordered: deque[_Ordered] = deque()
+        self._pending: deque[_PendingRender] = deque()
         self._ready = self._ended = False
 
     def ready(self) -> bool:
@@ -180,19 +180,19 @@ class _Draftsman:
             self.receive(0.0)
         return self._ready or self._ended
 
-    def draw(self, exposure: Exposure) -> ImageToCome:
-        image = _Ordered(self)
-        self._ordered.append(image)
+    def draw(self, exposure: Exposure) -> PendingImage:
+        image = _PendingRender(self)
+        self._pending.append(image)
         try:
-            self._orders.send(exposure())
+            self._requests.send(exposure())
         except OSError:
             self._end()
-        if self._ended:  # a process that is going away closes its pipes one by one: the order may have found a reader still
+        if self._ended:  # an ending process closes its pipes one by one: the request may still have found a reader
             self._end()
         return image
 
     def receive(self, timeout: float) -> bool:
-        """Receive an image, or the greeting before the first one, within a time [s]; return whether one was received."""
+        """Receive an image, or the ready message before the first one, within a time [s]; return whether one was received."""
         try:
             if self._ended or not self._poll.poll(1e3 * timeout):
                 return False
@@ -201,38 +201,38 @@ class _Draftsman:
             self._end()
             return False
         self._ready = True
-        if data != GREETING:
-            self._ordered.popleft().complete(np.frombuffer(data, np.uint8).reshape(self._shape))
+        if data != READY_MESSAGE:
+            self._pending.popleft().complete(np.frombuffer(data, np.uint8).reshape(self._shape))
         return True
 
     def _end(self) -> None:
         self._ended = True
-        while self._ordered:
-            self._ordered.popleft().complete(None)
+        while self._pending:
+            self._pending.popleft().complete(None)
 
 
-class _Ordered:
+class _PendingRender:
     on_demand = False
 
-    def __init__(self, draftsman: _Draftsman) -> None:
-        self._draftsman, self._complete = draftsman, False
+    def __init__(self, client: _RenderClient) -> None:
+        self._client, self._complete = client, False
         self._image: np.ndarray | None = None
 
     def complete(self, image: np.ndarray | None) -> None:
         self._complete, self._image = True, image
 
     def done(self, timeout: float = 0.0) -> bool:
-        while not self._complete and self._draftsman.receive(timeout):
+        while not self._complete and self._client.receive(timeout):
             pass
         return self._complete
 
     def result(self, region: Region | None = None) -> np.ndarray | None:
         while not self._complete:
-            self._draftsman.receive(1.0)
+            self._client.receive(1.0)
         return self._image
 
 
-def _seen(scenario: Scenario, seed: int, cameras: Collection[str]) -> list[tuple[str, Scene, CameraMount]]:
+def _camera_scenes(scenario: Scenario, seed: int, cameras: Collection[str]) -> list[tuple[str, Scene, CameraMount]]:
     """Return name, scene and true camera of each camera."""
     scene = build_scene(scenario, seed)
     mounts = true_mounts(scenario, load_vehicle(scenario.vehicle).mounts, seed)

@@ -104,10 +104,10 @@ class InnerLoop:
     """Converts body rates, or attitudes, and thrust to target speeds of the motors.
 
     Attributes:
-        watches: whether the loop itself handles commands that stop; this one leaves them to the motors' time-out.
+        handles_command_timeout: whether the loop itself handles commands that stop; this one leaves them to the motors' time-out.
     """
 
-    watches = False
+    handles_command_timeout = False
 
     def __init__(self, vehicle: Vehicle, lag_factor: float = 1.0) -> None:
         """
@@ -121,7 +121,7 @@ class InnerLoop:
         self._mass = vehicle.mass
         self._rotors = (np.array(vehicle.inertia), np.linalg.inv(vehicle.allocation), vehicle.thrust_coefficient, vehicle.speed_min,
                         vehicle.speed_max, vehicle.motor_time_constant)
-        self._coming: deque[tuple[int, np.ndarray, np.ndarray | None]] = deque()
+        self._pending: deque[tuple[int, np.ndarray, np.ndarray | None]] = deque()
         self._rates = np.zeros(4)
         self._attitude: np.ndarray | None = None
 
@@ -129,11 +129,11 @@ class InnerLoop:
         """Accept a command at a time [ns]: body rates [rad/s], thrust / mass [m/s^2], attitude xyzw for an attitude loop.
         A command that is not armed cancels all earlier ones."""
         if not armed:
-            self._coming.clear()
+            self._pending.clear()
             self._rates, self._attitude = np.zeros(4), None
             return
         values = np.array([*rates, thrust * self._mass], float)
-        self._coming.append((now + self._delay, values, None if attitude is None else np.array(attitude, float)))
+        self._pending.append((now + self._delay, values, None if attitude is None else np.array(attitude, float)))
 
     def speeds(self, now: int, x: np.ndarray, speeds: np.ndarray, sample: ImuSample | None = None) -> np.ndarray:
         """Return the target speeds of the motors for the period that begins now, (4,) [rad/s].
@@ -144,8 +144,8 @@ class InnerLoop:
             speeds: rotor speeds (4,) [rad/s].
             sample: last sample of the IMU; not used, as this loop has the true state.
         """
-        while self._coming and self._coming[0][0] <= now:
-            _, self._rates, self._attitude = self._coming.popleft()
+        while self._pending and self._pending[0][0] <= now:
+            _, self._rates, self._attitude = self._pending.popleft()
         rates = self._rates[:3] if self._attitude is None else rates_of_attitude(x[3:7], self._attitude, self._rates[:3],
                                                                                  self._attitude_lag)
         rates = self._gain[:3] * np.clip(rates, -self._rate_max, self._rate_max)

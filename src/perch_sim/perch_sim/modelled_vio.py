@@ -17,9 +17,9 @@ from perch_sim.lockstep import START
 from perch_sim.state_history import StateHistory, TrueState
 from perch_sim.vio_model import CAMERA, BiasModel, VioModel, VioModelParameters
 
-MEMORY = 200              # true states kept: 0.4 s
-MOST_FRAMES = 20          # that wait for the truth to cover their exposure, or for their answer to be due
-LONGEST_AHEAD = NANOSECONDS  # of a frame to the truth [ns]
+HISTORY_LENGTH = 200      # true states kept: 0.4 s
+MAX_PENDING_FRAMES = 20   # that wait for the truth to cover their exposure, or for their estimate to be due
+MAX_LEAD = NANOSECONDS    # of a frame over the truth [ns]
 RATE_VARIANCE = 1e-4      # of each axis of the angular velocity [rad^2/s^2]
 
 
@@ -53,13 +53,13 @@ class ModelledVio(Component[VioModelParameters]):
                                  seeding.stream(config.seed, "vio_model_biases"))
         self._latency = nanoseconds(config.latency)
         self._warned = False
-        self._begin()
+        self._reset()
 
-    def _begin(self) -> None:
-        self._history, self._newest = StateHistory(MEMORY), 0
-        self._frames: deque[int] = deque(maxlen=MOST_FRAMES)     # stamps of frames to be answered
+    def _reset(self) -> None:
+        self._history, self._newest = StateHistory(HISTORY_LENGTH), 0
+        self._frames: deque[int] = deque(maxlen=MAX_PENDING_FRAMES)  # stamps of frames without an estimate
         self._last_frame = 0
-        self._answers: deque[tuple[int, InertialState, OdometryState]] = deque(maxlen=MOST_FRAMES)  # (when it is due, ...)
+        self._pending_outputs: deque[tuple[int, InertialState, OdometryState]] = deque(maxlen=MAX_PENDING_FRAMES)  # (when it is due, ...)
 
     def on_truth(self, state: OdometryState) -> None:
         """Store a true state, and answer the frames that it covers."""
@@ -67,25 +67,25 @@ class ModelledVio(Component[VioModelParameters]):
             self._warned = True
             self.warn("vio_model is a stand-in: vio/odometry is the truth with drift and noise")
         if state.stamp <= self._newest:
-            self.warn("ground_truth/odometry: its stamps go back: begun anew", min_interval=1.0)
-            self._begin()
+            self.warn("ground_truth/odometry: stamps went back: estimator reset", min_interval=1.0)
+            self._reset()
         self._newest = state.stamp
         self._history.append(TrueState(state.stamp, np.array((*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B))))
         if self._frames:
-            self._answer()
+            self._estimate_frames()
         self._emit()
 
     def on_camera_info(self, model: CameraModel) -> None:
         """Record a frame, which is answered when the truth covers its exposure."""
-        if not self._last_frame < model.stamp <= self._newest + LONGEST_AHEAD:
-            self.warn(f"camera_{CAMERA}/camera_info: a stamp goes back or is ahead of the truth: not used", min_interval=1.0)
+        if not self._last_frame < model.stamp <= self._newest + MAX_LEAD:
+            self.warn(f"camera_{CAMERA}/camera_info: a stamp went back or is ahead of the truth: ignored", min_interval=1.0)
             return
         self._last_frame = model.stamp
         self._frames.append(model.stamp)
-        self._answer()
+        self._estimate_frames()
         self._emit()
 
-    def _answer(self) -> None:
+    def _estimate_frames(self) -> None:
         """Compute the estimates of all frames whose exposure the truth covers."""
         while self._frames and self._frames[0] - self._offset <= self._newest:
             exposed = self._frames.popleft() - self._offset
@@ -94,7 +94,7 @@ class ModelledVio(Component[VioModelParameters]):
             except LookupError as error:
                 self.warn(f"frame without truth: {error}", min_interval=1.0)
             else:
-                self._answers.append((exposed + self._latency, *self._estimate(state)))
+                self._pending_outputs.append((exposed + self._latency, *self._estimate(state)))
 
     def _estimate(self, state: TrueState) -> tuple[InertialState, OdometryState]:
         e = self._model.degrade(state.time * 1e-9, state.p_WB, state.q_WB, state.v_WB)
@@ -110,7 +110,7 @@ class ModelledVio(Component[VioModelParameters]):
         return inertial, odometry
 
     def _emit(self) -> None:
-        while self._answers and self._answers[0][0] <= self._newest:
-            _, inertial, odometry = self._answers.popleft()
+        while self._pending_outputs and self._pending_outputs[0][0] <= self._newest:
+            _, inertial, odometry = self._pending_outputs.popleft()
             self.state(inertial)
             self.odometry(odometry)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-LONGEST_CATCH_UP = 25  # steps; a machine that was away for longer does not run after lost time
+MAX_CATCH_UP = 25  # steps; time lost beyond this is skipped
 
 
 class Pacing:
@@ -11,7 +11,7 @@ class Pacing:
     def __init__(self, period: int, now: int) -> None:
         self._period, self._epoch, self._done = period, now, 0
         self.misses = 0   # steps that began more than a period late
-        self.skipped = 0  # periods of wall-clock time given up
+        self.skipped = 0  # periods of wall-clock time that were skipped
 
     def due(self, now: int) -> int:
         """Return the number of steps that the caller is to execute at the time `now`."""
@@ -19,10 +19,10 @@ class Pacing:
         if behind <= 0:
             return 0
         self.misses += behind - 1
-        if behind > LONGEST_CATCH_UP:
-            lost = behind - LONGEST_CATCH_UP
+        if behind > MAX_CATCH_UP:
+            lost = behind - MAX_CATCH_UP
             self.skipped += lost
             self._epoch += lost * self._period
-            behind = LONGEST_CATCH_UP
+            behind = MAX_CATCH_UP
         self._done += behind
         return behind

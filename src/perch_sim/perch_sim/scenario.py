@@ -33,7 +33,7 @@ NODES = {
     "viewer": "perch_eval",
 }
 """Node, also the name of its executable -> package."""
-MOST_CABLES = 100
+MAX_CABLES = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +68,7 @@ class Cable:
     radius: float = quantity(0.03, unit="m", low=1e-4, high=1.0)
     colour: str = choice("red", options=("red", "grey"))
 
-    def hanging(self) -> Catenary:
+    def catenary(self) -> Catenary:
         """Return the true catenary of the cable; raises PerchError if it has none."""
         return Catenary.from_sag(np.array(self.start), np.array(self.end), self.sag)
 
@@ -200,7 +200,7 @@ class Scenario:
                 raise ConfigError("", f"parameters.{node}", f"is not one of {', '.join(NODES)}")
         x, y, z = self.start.position
         if self._outside(np.array(self.start.position)) or z != 0.0:
-            raise ConfigError("", "start.position", f"({x:g}, {y:g}, {z:g}) m is no place on the floor of the room")
+            raise ConfigError("", "start.position", f"({x:g}, {y:g}, {z:g}) m is not on the floor of the room")
         low, high = self.adhesion.normal_speed
         if not low < high:
             raise ConfigError("", "adhesion.normal_speed", f"[{low:g}, {high:g}] m/s is empty")
@@ -216,14 +216,14 @@ class Scenario:
 
     def _check_cables(self) -> None:
         cables = self.world.cables
-        if len(cables) > MOST_CABLES or self.mode == "powerline" and not cables:
-            raise ConfigError("", "world.cables", f"has {len(cables)} entries, outside [{int(self.mode == 'powerline')}, {MOST_CABLES}]")
+        if len(cables) > MAX_CABLES or self.mode == "powerline" and not cables:
+            raise ConfigError("", "world.cables", f"has {len(cables)} entries, outside [{int(self.mode == 'powerline')}, {MAX_CABLES}]")
         for k, cable in enumerate(cables):
             chord = math.dist(cable.start, cable.end)
             if cable.sag > chord:
                 raise ConfigError("", f"world.cables[{k}].sag", f"{cable.sag:g} m is outside [0, {chord:g}] m, the distance of the ends")
             try:
-                cable.hanging()
+                cable.catenary()
             except PerchError as error:
                 raise ConfigError("", f"world.cables[{k}]", str(error)) from None
 

@@ -18,7 +18,7 @@ from perch_core.values import (
     Transform, limits, rotated, seconds)
 from perch_sim.camera_stream import Delivery
 from perch_sim.contact_event import ContactState
-from perch_sim.drawing import Drawing, DrawnInProcesses
+from perch_sim.drawing import Rendering, ProcessRendering
 from perch_sim.lockstep.batches import Arrival
 from perch_sim.motors import MotorCommandError
 from perch_sim.pacing import Pacing
@@ -29,12 +29,12 @@ from perch_sim.state_history import TrueState
 from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 
 SLOW_STEPS = 5                         # steps from one clock, rotor state or pose of a moving pad to the next: 100 Hz
-MOST_WAITING = 2                       # images per camera that are being drawn in real time; a slow machine sees fewer, not older ones
+MAX_PENDING_IMAGES = 2                 # images per camera being rendered in real time: a slow machine gets fewer, not older ones
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000  # with a busy operating system in between [ns]
-COMMANDS_MISSED = 0.25                  # share of a second's steps without a command of their own at which that is said
+COMMANDS_MISSED = 0.25                 # share of steps without a new command in a second above which it warns
 EXACT = np.zeros((6, 6))               # covariance of the truth
 
-MakeDrawing = Callable[[Scenario, int, Collection[str]], Drawing]
+MakeRendering = Callable[[Scenario, int, Collection[str]], Rendering]
 
 
 class SimulatedVehicle(Component[VehicleParameters]):
@@ -62,12 +62,12 @@ class SimulatedVehicle(Component[VehicleParameters]):
     info_down, image_down = Output(CameraModel, "camera_down/camera_info"), Output(CameraImage, "camera_down/image_raw")
     info_front, image_front = Output(CameraModel, "camera_front/camera_info"), Output(CameraImage, "camera_front/image_raw")
 
-    def __init__(self, config: VehicleParameters, scenario: Scenario | None = None, drawing: MakeDrawing = DrawnInProcesses) -> None:
+    def __init__(self, config: VehicleParameters, scenario: Scenario | None = None, drawing: MakeRendering = ProcessRendering) -> None:
         """
         Args:
             config: parameters.
             scenario: scenario of the flight; None: the one that the parameters name.
-            drawing: renders images, `DrawnInProcesses` or `DrawnOnDemand`.
+            drawing: renders images, `ProcessRendering` or `OnDemandRendering`.
 
         Raises:
             ConfigError: the scenario, its vehicle or its board does not exist, or has a camera that is not simulated.
@@ -90,7 +90,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
         self._last_command = 0                   # newest stamp of a command
         self._pacing: Pacing | None = None       # in real time
         self._broken: set[str] = set()           # cameras without images for the rest of the flight
-        self._diagnosed, self._judged = self.time, (0, 0)  # then; steps, and commands that were missed, by then
+        self._diagnosed, self._last_counts = self.time, (0, 0)  # time of the last diagnostics; steps and missed commands by then
         self._counts = {"commands_missed": 0, "commands_refused": 0, "images_late": 0}
 
     def warm_up(self) -> None:
@@ -111,17 +111,17 @@ class SimulatedVehicle(Component[VehicleParameters]):
 
     def on_motor_command(self, command: MotorCommand) -> None:
         """Set rotor speeds, which take effect in the next step."""
-        self._take("rotor_speeds", command, command.rotor_speed)
+        self._apply_command("rotor_speeds", command, command.rotor_speed)
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Pass body rates and thrust to the inner loop."""
-        self._take("rates_and_thrust", command, command.w_B, command.thrust)
+        self._apply_command("rates_and_thrust", command, command.w_B, command.thrust)
 
     def on_attitude_thrust(self, command: AttitudeThrust) -> None:
         """Pass attitude and thrust to the inner loop."""
-        self._take("attitude_and_thrust", command, command.w_B, command.thrust, command.q_WB)
+        self._apply_command("attitude_and_thrust", command, command.w_B, command.thrust, command.q_WB)
 
-    def _take(self, kind: str, command: MotorCommand | RatesThrust | AttitudeThrust, *content: Any) -> None:
+    def _apply_command(self, kind: str, command: MotorCommand | RatesThrust | AttitudeThrust, *content: Any) -> None:
         """Pass a command to the motors or to the inner loop; log a refused command and the reason."""
         simulation = self.simulation
         try:
@@ -129,8 +129,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
                 raise MotorCommandError(f"{simulation.vehicle.name} takes {simulation.vehicle.actuation.type}, not {kind}: ignored")
             if command.stamp < self._last_command:
                 raise MotorCommandError(f"{kind}: of {seconds(command.stamp):.3f} s, older than the one before: ignored")
-            if simulation.loop is not None and command.armed and (said := limits.problem(command)):
-                raise MotorCommandError(f"{kind}: {said}")
+            if simulation.loop is not None and command.armed and (problem := limits.problem(command)):
+                raise MotorCommandError(f"{kind}: {problem}")
             if simulation.loop is None:
                 simulation.motors.command(self.time, command.armed, *content)
             else:
@@ -142,7 +142,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
         if self._last_command < command.stamp <= self.time:
             self._last_command = command.stamp
 
-    # -- going on ----------------------------------------------------------------------------------------------------
+    # -- stepping ----------------------------------------------------------------------------------------------------
 
     def advance(self) -> list[Arrival]:
         """Advance one control period with the present command, and emit its outputs; images may not be rendered yet.
@@ -154,7 +154,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
         arrivals = []
         for name, camera in self.simulation.cameras.items():
             if camera.due(self.time) is not None:
-                arrivals.append(self._show(name, camera.take()))
+                arrivals.append(self._emit_frame(name, camera.take()))
         return arrivals
 
     def on_pace(self, now: int) -> None:
@@ -163,7 +163,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
             self._pacing = Pacing(CONTROL_PERIOD_NS, now)
             self.simulation.motors.timeout = REAL_TIME_MOTOR_TIMEOUT
             for camera in self.simulation.cameras.values():
-                camera.most_waiting = MOST_WAITING
+                camera.max_pending_images = MAX_PENDING_IMAGES
         for _ in range(self._pacing.due(now)):
             if 0 < self._last_command < self.time:
                 self._counts["commands_missed"] += 1
@@ -173,9 +173,9 @@ class SimulatedVehicle(Component[VehicleParameters]):
                 if delivery is None:
                     continue
                 if delivery.image is None or delivery.image.on_demand or delivery.image.done():
-                    self._show(name, camera.take())
+                    self._emit_frame(name, camera.take())
                 else:
-                    self._counts["images_late"] += 1  # one step each: it goes out when it is drawn
+                    self._counts["images_late"] += 1  # one step each: it is emitted when it is rendered
             if self.time - self._diagnosed >= NANOSECONDS:
                 self.diagnose()
 
@@ -189,12 +189,12 @@ class SimulatedVehicle(Component[VehicleParameters]):
         if self.truth.has_receivers:
             self.truth(true_odometry(output.state))
         for event in output.contacts:
-            self._touch(event)
+            self._emit_contact(event)
         if index % SLOW_STEPS == 0:
-            self._show_slow(index)
+            self._emit_slow(index)
         self._index += 1
 
-    def _show_slow(self, index: int) -> None:
+    def _emit_slow(self, index: int) -> None:
         plant, scenario = self.simulation.plant, self.scenario
         self.clock(self.time)
         if self.rotors.has_receivers:
@@ -203,7 +203,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
             pad = self.simulation.pad
             self.target(PoseStamped(self.time, tuple(pad.p_WS.tolist()), tuple(so3.quat_from_matrix(pad.R_WS).tolist())))
 
-    def _touch(self, event: Contact) -> None:
+    def _emit_contact(self, event: Contact) -> None:
         self.contact(event)
         state = ContactState(event.state).name.lower()
         self.info(f"t = {event.stamp * 1e-9:.3f} s: {event.body}: {state}" + (f" ({event.reason})" if event.reason else ""))
@@ -217,22 +217,22 @@ class SimulatedVehicle(Component[VehicleParameters]):
             raise ConfigError(f"vehicles/{self.scenario.vehicle}", f"cameras.{camera}",
                               "is not one of down, front, which are simulated") from None
 
-    def _show(self, name: str, delivery: Delivery) -> Arrival:
+    def _emit_frame(self, name: str, delivery: Delivery) -> Arrival:
         """Emit a frame: its camera model, and its image if there is one."""
-        stream, frame, coming = self.simulation.cameras[name], delivery.frame, delivery.image
+        stream, frame, pending = self.simulation.cameras[name], delivery.frame, delivery.image
         if stream.broken and name not in self._broken:
             self._broken.add(name)
-            self.log(LogLine("error", f"camera_{name}: the process that draws its images has ended: no images any more"))
+            self.log(LogLine("error", f"camera_{name}: the process that renders its images has ended: no more images"))
         info, emit = self._cameras[name]
         camera, image = stream.mount.camera, None
         info(CameraModel(frame.stamp, optical_frame(name), camera))
-        if coming is not None:
+        if pending is not None:
             image = CameraImage(frame.stamp, optical_frame(name), camera.width, camera.height, "rgb8" if stream.mount.colour else "mono8",
-                                coming.result, None if coming.on_demand else coming.done)
+                                pending.result, None if pending.on_demand else pending.done)
             emit(image)
         return Arrival(name, frame.stamp, frame.middle, image)
 
-    # -- people ------------------------------------------------------------------------------------------------------
+    # -- diagnostics -------------------------------------------------------------------------------------------------
 
     def diagnose(self) -> None:
         """Emit diagnostics; warn if too many commands are missed."""
@@ -243,8 +243,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
         if self._pacing is not None:
             values |= {"images_dropped": sum(camera.dropped for camera in simulation.cameras.values()),
                        "deadlines_missed": self._pacing.misses, "periods_skipped": self._pacing.skipped}
-        steps, missed = self._index - self._judged[0], self._counts["commands_missed"] - self._judged[1]
-        self._judged = self._index, self._counts["commands_missed"]
+        steps, missed = self._index - self._last_counts[0], self._counts["commands_missed"] - self._last_counts[1]
+        self._last_counts = self._index, self._counts["commands_missed"]
         level, message = 0, "ok"
         if missed > COMMANDS_MISSED * steps:
             level, message = 1, f"{100 * missed / steps:.0f} % of the controller's commands are lost or late"

@@ -24,7 +24,7 @@ from perch_sim import seeding
 from perch_sim.calibration import true_imu, true_mounts
 from perch_sim.camera_stream import CameraStream
 from perch_sim.camera_timing import CameraTiming
-from perch_sim.drawing import Drawing
+from perch_sim.drawing import Rendering
 from perch_sim.imu import Imu, ImuSample
 from perch_sim.inner_loop import inner_loop
 from perch_sim.lockstep.tasks import START
@@ -52,7 +52,7 @@ class Output(NamedTuple):
 class Simulation:
     """A vehicle in flight. All times are on the IMU's clock [ns]."""
 
-    def __init__(self, scenario: Scenario, seed: int, drawing: Drawing | None = None) -> None:
+    def __init__(self, scenario: Scenario, seed: int, drawing: Rendering | None = None) -> None:
         """
         Args:
             scenario: scenario of the flight.
@@ -76,7 +76,7 @@ class Simulation:
         self._history.append(self.plant.state)
         self.cameras = self._make_cameras(seed, drawing)
 
-    def _make_cameras(self, seed: int, drawing: Drawing | None) -> dict[str, CameraStream]:
+    def _make_cameras(self, seed: int, drawing: Rendering | None) -> dict[str, CameraStream]:
         cameras, mounts = {}, self.vehicle.mounts
         for name, true in true_mounts(self.scenario, mounts, seed).items():
             exposure = control_exposure(true, self.scenario.world.light).time
@@ -108,7 +108,7 @@ class Simulation:
             self.plant.release()
         if self.loop is not None:
             speeds = self.loop.speeds(self.time, self.state.x, self.plant.rotor_speed, self._sample)
-            self.motors.aim(speeds, self.time if self.loop.watches else None)
+            self.motors.aim(speeds, self.time if self.loop.handles_command_timeout else None)
         result = self.plant.advance(self.motors.target(self.time))
         for state in result.states:
             self._history.append(state)

@@ -38,7 +38,7 @@ class TrueState(NamedTuple):
         return self.x[10:13]
 
 
-Place = tuple[TrueState, TrueState, float]
+Bracket = tuple[TrueState, TrueState, float]
 """Two successive states, and the interpolation parameter 0..1 between them."""
 
 
@@ -58,11 +58,11 @@ class StateHistory:
         Raises:
             LookupError: the time lies outside the history.
         """
-        a, b, s = self.around(time)
+        a, b, s = self.bracket(time)
         p, q = between([(a, b, s)])
         return TrueState(time, np.concatenate([p[0], q[0], a.x[7:] + s * (b.x[7:] - a.x[7:])]))
 
-    def around(self, time: int) -> Place:
+    def bracket(self, time: int) -> Bracket:
         """Return the states before and after a time [ns], and the interpolation parameter 0..1 between them.
 
         Raises:
@@ -81,11 +81,11 @@ class StateHistory:
         return a, b, (time - a.time) / (b.time - a.time)
 
 
-def between(places: Sequence[Place]) -> tuple[np.ndarray, np.ndarray]:
+def between(brackets: Sequence[Bracket]) -> tuple[np.ndarray, np.ndarray]:
     """Return the positions (n, 3) and attitudes (n, 4) that are interpolated between states."""
     # The weights in plain floats: the same bits for one time and for many.
     weights = np.array([((1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s), (b.time - a.time) * 1e-9 * s * (1 - s), 1 - s, s)
-                        for a, b, s in places]).T[..., None]
-    before, after = ([np.array([getattr(place[k], name) for place in places]) for name in ("p_WB", "v_WB", "q_WB")] for k in (0, 1))
+                        for a, b, s in brackets]).T[..., None]
+    before, after = ([np.array([getattr(bracket[k], name) for bracket in brackets]) for name in ("p_WB", "v_WB", "q_WB")] for k in (0, 1))
     p = weights[0] * before[0] + weights[1] * after[0] + weights[2] * (weights[3] * before[1] - weights[4] * after[1])
     return p, so3.quat_slerp(before[2], after[2], weights[4, :, 0])

@@ -10,7 +10,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from perch_sim.scenario import Wind
 
 LENGTH = 5.0          # scale of the turbulence a few metres above ground [m]
-LEAST_AIRSPEED = 1.0  # speed at which gusts pass when there is no steady wind [m/s]
+MIN_AIRSPEED = 1.0  # speed at which gusts pass when there is no steady wind [m/s]
 
 
 def dryden(sigma: float, length: float, airspeed: float) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
@@ -67,7 +67,7 @@ class WindField:
         self._axes = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         self._filters = ([] if wind.gust_sigma == 0.0 else
                          [_Filter(*part, step, rng)
-                          for part in dryden(wind.gust_sigma, LENGTH, max(speed, LEAST_AIRSPEED))])
+                          for part in dryden(wind.gust_sigma, LENGTH, max(speed, MIN_AIRSPEED))])
 
     def next(self) -> np.ndarray:
         """Return the air velocity in W over the next step, (3,) [m/s]."""

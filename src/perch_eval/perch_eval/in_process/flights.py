@@ -18,7 +18,7 @@ from perch_eval.in_process.modelled_sight import MapParameters, ModelledMap, mod
 from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.in_process.trace import FlightTrace
 from perch_perception.target_localizer import TargetLocalizerConfig
-from perch_sim.drawing import DrawnOnDemand
+from perch_sim.drawing import OnDemandRendering
 from perch_sim.lockstep import Task, flight_tasks
 from perch_sim.parameters import VehicleParameters
 from perch_sim.scenario import Scenario
@@ -66,7 +66,7 @@ def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, repl
              if name not in left_out]
     front = "target_localizer" in names or sensing.target == "rendered"  # its frames start work, whether or not they are drawn
     cameras = {(True, True): "all", (True, False): "down", (False, True): "front", (False, False): "none"}[sensing.vio == "rendered", front]
-    vehicle = SimulatedVehicle(VehicleParameters(seed=seed, cameras=cameras), scenario, DrawnOnDemand)
+    vehicle = SimulatedVehicle(VehicleParameters(seed=seed, cameras=cameras), scenario, OnDemandRendering)
     components = {}
     for name in names:
         if name in replace:

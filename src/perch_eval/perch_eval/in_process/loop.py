@@ -80,8 +80,9 @@ class Loop:
         self.filters: dict[tuple[str, str], Filter] = {}
         self.trace = FlightTrace()
         server_participants = {name: LocalParticipant(server, name=name) for name, server in servers.items()}
-        ask = local_servers(server_participants.values())
-        members = {name: _FilteredParticipant(component, self.filters, ask=ask, name=name) for name, component in components.items()}
+        send_request = local_servers(server_participants.values())
+        members = {name: _FilteredParticipant(component, self.filters, send_request=send_request, name=name)
+                   for name, component in components.items()}
         self._participants = server_participants | members
         self._schedule = Schedule(vehicle, members.values(), tasks)
         for component in (vehicle, *self.components.values()):
@@ -102,7 +103,7 @@ class Loop:
             PerchError: the schedule waits for a result; in one process it can never arrive.
         """
         if not self._schedule.advance():
-            raise PerchError(f"the flight waits for {', '.join(f'{owed.what} of {owed.name}' for owed in self._schedule.owed())}")
+            raise PerchError(f"the flight waits for {', '.join(f'{missing.what} of {missing.name}' for missing in self._schedule.pending())}")
         return self._schedule.now
 
     def request(self, name: str, port: str, request: Any) -> Any:

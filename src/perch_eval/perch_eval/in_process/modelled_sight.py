@@ -77,16 +77,16 @@ class ModelledLocalizer:
         self._last = self._last_search = -np.inf
         self._R_CS: np.ndarray | None = None
 
-    def process(self, image: Any, exposed: float, body: BodyState | None) -> Localization:
+    def process(self, image: Any, exposure_time: float, body: BodyState | None) -> Localization:
         """Return the modelled localisation of an image, whose content is ignored; arguments as those of `Localizer.process`."""
-        tracking = exposed - self._last <= LOST_AFTER
+        tracking = exposure_time - self._last <= LOST_AFTER
         if not tracking:
             self._R_CS = None
-            if exposed - self._last_search < SEARCH_PERIOD - 1e-3:
+            if exposure_time - self._last_search < SEARCH_PERIOD - 1e-3:
                 return Localization(None, message="waiting for the next search")
-            self._last_search = exposed
+            self._last_search = exposure_time
         try:
-            state = self._truth.at(self.middle(exposed))
+            state = self._truth.at(self.middle(exposure_time))
         except LookupError as error:  # an image from before the first true state
             return Localization(None, message=str(error))
         pixels, ids, side = self._visible(state, self._pad())
@@ -102,14 +102,14 @@ class ModelledLocalizer:
             return Localization(None, message=str(refusal))
         if not MIN_RANGE <= np.linalg.norm(pose.p_CS) <= self._config.max_range:
             return Localization(None, message="not a board of this size")
-        self._last, self._R_CS = exposed, pose.R_CS
+        self._last, self._R_CS = exposure_time, pose.R_CS
         complete = len(ids) == len(self._board.ids)
         average = average_board(self._mount.camera, corners_S, rays, ids) if self._config.mode == "average" and complete else None
         return Localization(pose, average, complete)
 
-    def middle(self, exposed: float) -> int:
-        """Return the true middle of an exposure [ns], which by the calibrated stamp offset is at `exposed` [s]."""
-        stamp = round((exposed + self._mount.stamp_offset) * NANOSECONDS)
+    def middle(self, exposure_time: float) -> int:
+        """Return the true middle of an exposure [ns], which by the calibrated stamp offset is at `exposure_time` [s]."""
+        stamp = round((exposure_time + self._mount.stamp_offset) * NANOSECONDS)
         return stamp - round(self._true.stamp_offset * NANOSECONDS)
 
     def _visible(self, state: TrueState, pad: PerchSurface) -> tuple[np.ndarray, tuple[int, ...], np.ndarray]:

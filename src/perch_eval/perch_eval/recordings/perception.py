@@ -82,9 +82,9 @@ class _Target(TargetLocalizer):
     found: Gallery
     missed: Gallery
 
-    def look(self, image: CameraImage, exposed: float) -> None:
+    def process_image(self, image: CameraImage, exposure_time: float) -> None:
         """Process an image as the base class does and offer a picture."""
-        super().look(image, exposed)
+        super().process_image(image, exposure_time)
         sighting = self.sightings[-1]
         (self.missed if sighting.pose_camera is None else self.found).offer(lambda: self._drawn(image, sighting))
 
@@ -105,9 +105,9 @@ class _Wires(PowerlineMapper):
 
     gallery: Gallery
 
-    def look(self, image: CameraImage, exposed: float) -> None:
+    def process_image(self, image: CameraImage, exposure_time: float) -> None:
         """Process an image as the base class does and offer a picture."""
-        super().look(image, exposed)
+        super().process_image(image, exposure_time)
         self.gallery.offer(lambda: self._drawn(image))
 
     def _drawn(self, image: CameraImage) -> GalleryImage | None:

@@ -94,7 +94,7 @@ def world_markers(scenario: Scenario) -> list[Marker]:
         out.append(marker(Shape.CUBE, "surface", 0, SURFACE, (*scenario.target.panel_size, 0.02), surface.p_WS - 0.02 * surface.normal, q))
         out.append(marker(Shape.CUBE, "pad", 0, PAD, (*surface.size, 0.01), surface.p_WS - 0.005 * surface.normal, q))
     for k, cable in enumerate(world.cables):
-        out.append(polyline("cables", k, CABLES[cable.colour], 2 * cable.radius, cable.hanging().sample(2 if cable.sag == 0.0 else 40)))
+        out.append(polyline("cables", k, CABLES[cable.colour], 2 * cable.radius, cable.catenary().sample(2 if cable.sag == 0.0 else 40)))
     if scenario.mode == "inspection":
         points = [w.position for w in scenario.inspection.waypoints]
         out.append(polyline("waypoints", 0, PLANNED, 0.01, points))

@@ -1,6 +1,6 @@
 """Powerlines from images: wires are detected, associated and triangulated with the poses of their exposures."""
 
-from perch_perception.line_mapping.backdrop import Backdrop
+from perch_perception.line_mapping.backdrop import BackgroundCheck
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.detection import LineDetectionConfig, LineSighting, detect_lines
 from perch_perception.line_mapping.mapper import LineMapper, MapperConfig
@@ -8,5 +8,5 @@ from perch_perception.line_mapping.observation import LineObservation, place
 from perch_perception.line_mapping.triangulation import (
     TriangulationConfig, Undetermined, WireEstimate, triangulate)
 
-__all__ = ["Backdrop", "Undetermined", "LineDetectionConfig", "LineMapper", "LineObservation", "LineSighting", "MapperConfig",
+__all__ = ["BackgroundCheck", "Undetermined", "LineDetectionConfig", "LineMapper", "LineObservation", "LineSighting", "MapperConfig",
            "TriangulationConfig", "WireCurve", "WireEstimate", "detect_lines", "place", "triangulate"]

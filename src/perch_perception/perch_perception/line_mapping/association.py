@@ -8,16 +8,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from perch_core.covariance import largest_sigma
-from perch_perception.line_mapping.detection import LEAST_WIDTH, SIGMA
+from perch_perception.line_mapping.detection import MIN_WIDTH, SIGMA
 from perch_perception.line_mapping.observation import LineObservation
 from perch_perception.line_mapping.triangulation import WireEstimate
 
 
 WIDTH_RATIO = 1.4  # a wire looks as wide as it did, up to this factor: two that meet in the image look wider, a part of one less wide
 MAPPED_GATE = 1.2  # of a sighting to a triangulated wire [deg]
-FOLLOWED_GATE = 5.0  # to the last sighting of a wire that is not triangulated yet [deg]
-DISTINCT = 2.0  # the second-best wire must be so many times worse
-REACH = 1.5  # how far a wire may go on beyond what was seen [m]
+TRACKED_GATE = 5.0  # to the last sighting of a wire that is not triangulated yet [deg]
+AMBIGUITY_RATIO = 2.0  # the second-best wire must be so many times worse
+MAX_EXTRAPOLATION = 1.5  # how far a wire may go on beyond what was seen [m]
 
 
 class Track(Protocol):
@@ -30,11 +30,11 @@ class Track(Protocol):
 
 def score(track: Track, seen: LineObservation) -> float:
     """Return the misfit of a sighting to a wire in units of the gate; inf where they cannot match."""
-    if not _as_wide(track, seen):
+    if not _width_matches(track, seen):
         return np.inf
     if track.estimate is not None:
         return _score_mapped(track.estimate, track.extent, seen)
-    return _score_followed(track.last, seen) / np.radians(FOLLOWED_GATE)
+    return _score_tracked(track.last, seen) / np.radians(TRACKED_GATE)
 
 
 def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, seen: LineObservation) -> float:
@@ -46,7 +46,7 @@ def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, se
     s = against.s
     if extent is not None:
         low, high = extent
-        if s.max() < low - REACH or s.min() > high + REACH:
+        if s.max() < low - MAX_EXTRAPOLATION or s.min() > high + MAX_EXTRAPOLATION:
             return np.inf
     middle = float(s[len(s) // 2])
     distance = float(np.linalg.norm(curve.at(middle) - seen.p_WC))
@@ -54,7 +54,7 @@ def _score_mapped(estimate: WireEstimate, extent: tuple[float, float] | None, se
     return float(np.sqrt(np.mean(against.angles**2))) / (np.radians(MAPPED_GATE) + 2.0 * unsure)
 
 
-def _score_followed(last: LineObservation, seen: LineObservation) -> float:
+def _score_tracked(last: LineObservation, seen: LineObservation) -> float:
     """Return the angle by which a sighting leaves the plane of the last one [rad]: parallax only, as rays are in W."""
     normal = last.normal
     offset = float(np.sqrt(np.mean((seen.rays_W @ normal) ** 2)))
@@ -68,18 +68,18 @@ def _score_followed(last: LineObservation, seen: LineObservation) -> float:
     return offset
 
 
-def _as_wide(track: Track, seen: LineObservation) -> bool:
+def _width_matches(track: Track, seen: LineObservation) -> bool:
     """Whether a sighting is about as wide as the wire should appear, or was in its last image; unmeasurable widths match."""
     width = track.last.width if track.estimate is None else track.estimate.width_from(seen.p_WC)
     if np.isnan(width):  # nothing is known of its radius
         return True
-    thin = _thin(seen)
+    thin = _min_width(seen)
     return bool(1.0 / WIDTH_RATIO < max(seen.width, thin) / max(width, thin) < WIDTH_RATIO)
 
 
-def _thin(seen: LineObservation) -> float:
+def _min_width(seen: LineObservation) -> float:
     """Return the width of the thinnest wire that can be measured [rad]."""
-    return LEAST_WIDTH / SIGMA * seen.sigma
+    return MIN_WIDTH / SIGMA * seen.sigma
 
 
 def meets_another(tracks: Sequence[Track], owner: Track, seen: LineObservation) -> bool:
@@ -102,12 +102,12 @@ def meets_another(tracks: Sequence[Track], owner: Track, seen: LineObservation) 
         if track is owner or other is None or track.extent is None:
             continue
         against = other.curve.offsets(centre, to / distance)
-        if against.ahead[0] <= 0.0 or not track.extent[0] - REACH < against.s[0] < track.extent[1] + REACH:
+        if against.ahead[0] <= 0.0 or not track.extent[0] - MAX_EXTRAPOLATION < against.s[0] < track.extent[1] + MAX_EXTRAPOLATION:
             continue
         apart, half, its = abs(float(against.angles[0])), 0.5 * own.width_from(seen.p_WC), 0.5 * other.width_from(seen.p_WC)
         unsure = np.hypot(largest_sigma(own.point_covariance(float(s[0]))) / distance,
                           largest_sigma(other.point_covariance(float(against.s[0]))) / float(against.ahead[0]))
-        if half - its - unsure < apart < half + its + unsure + _thin(seen):  # neither hidden behind it nor apart from it
+        if half - its - unsure < apart < half + its + unsure + _min_width(seen):  # neither hidden behind it nor apart from it
             return True
     return False
 
@@ -127,7 +127,7 @@ def associate(tracks: Sequence[Track], seen: Sequence[LineObservation]) -> list[
             continue
         done.add(i)
         rivals = [scores[i, k] for k in range(len(tracks)) if k != j]
-        if rivals and min(rivals) < min(1.0, DISTINCT * max(value, 0.1)):
+        if rivals and min(rivals) < min(1.0, AMBIGUITY_RATIO * max(value, 0.1)):
             answer[i] = None
             continue
         answer[i] = j

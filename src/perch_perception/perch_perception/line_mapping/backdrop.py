@@ -16,13 +16,13 @@ from perch_core.camera import Camera
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.observation import LineObservation
 
-ASIDE = (-24.0, -17.0, 17.0, 24.0)  # where beside a wire its surroundings are looked at, clear of a wire of 20 px [px]
+SIDE_OFFSETS = (-24.0, -17.0, 17.0, 24.0)  # places beside a wire that are tracked, clear of a wire of 20 px [px]
 WINDOW = 11                        # of the optical flow [px]
-RETURNS = 0.7                      # flow there and back ends within this [px]
-LEAST_SHIFT = 3.0                  # between both hypotheses, across the wire; less tells nothing [px]
-FEWEST = 6                         # places that must be tracked
+MAX_RETURN_ERROR = 0.7             # flow there and back ends within this [px]
+MIN_SHIFT = 3.0                    # between both hypotheses, across the wire; less does not distinguish them [px]
+MIN_PLACES = 6                     # places that must be tracked
 ATTACHED, APART = 0.8, 0.6         # i of what carries the wire, and of what is behind it
-BASELINE, OLDEST = 0.1, 1.0        # distance [m] and time [s] after which the image to compare with is replaced
+BASELINE, MAX_AGE = 0.1, 1.0       # distance [m] and time [s] after which the image to compare with is replaced
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class _View:
         return camera.project((points_W - self.p_WC) @ self.R_WC)[0]
 
 
-class Backdrop:
+class BackgroundCheck:
     """Compares each image with one taken some centimetres before."""
 
     def __init__(self, camera: Camera) -> None:
@@ -47,14 +47,14 @@ class Backdrop:
         self._before: _View | None = None
         self._now: _View | None = None
 
-    def look(self, grey: np.ndarray, time: float, p_WC: np.ndarray, R_WC: np.ndarray) -> None:
+    def add_image(self, grey: np.ndarray, time: float, p_WC: np.ndarray, R_WC: np.ndarray) -> None:
         """Add the next image, mono8, its time [s] and its camera's pose."""
-        if self._now is not None and (self._before is None or time - self._before.time > OLDEST
+        if self._now is not None and (self._before is None or time - self._before.time > MAX_AGE
                                       or np.linalg.norm(p_WC - self._before.p_WC) > BASELINE):
             self._before = self._now
         self._now = _View(grey, time, np.array(p_WC), np.array(R_WC))
 
-    def attached(self, seen: LineObservation, curve: WireCurve) -> bool | None:
+    def is_on_surface(self, seen: LineObservation, curve: WireCurve) -> bool | None:
         """Whether a sighting in the last image lies on the surface beside it; None where the motion does not decide this.
 
         Args:
@@ -68,22 +68,22 @@ class Backdrop:
         on = camera.project(seen.rays_W @ now.R_WC)[0]
         along = np.gradient(on, axis=0)
         normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
-        places = (on + np.array(ASIDE)[:, None, None] * normal).reshape(-1, 2)
+        places = (on + np.array(SIDE_OFFSETS)[:, None, None] * normal).reshape(-1, 2)
         rays_W = camera.unproject(places) @ now.R_WC.T
-        distance = np.tile(np.linalg.norm(points_W - seen.p_WC, axis=1), len(ASIDE))
+        distance = np.tile(np.linalg.norm(points_W - seen.p_WC, axis=1), len(SIDE_OFFSETS))
         near = before.project(camera, now.p_WC + distance[:, None] * rays_W)
         far = camera.project(rays_W @ before.R_WC)[0]
-        normal = np.tile(normal, (len(ASIDE), 1))
+        normal = np.tile(normal, (len(SIDE_OFFSETS), 1))
         shift = np.sum((near - far) * normal, axis=1)
         ok = np.isfinite(near).all(axis=1) & np.isfinite(far).all(axis=1) & camera.contains(places, 8.0) & camera.contains(near, 8.0)
-        ok &= np.abs(shift) > LEAST_SHIFT
-        if ok.sum() < FEWEST:
+        ok &= np.abs(shift) > MIN_SHIFT
+        if ok.sum() < MIN_PLACES:
             return None
         places, near, far, normal, shift = places[ok], near[ok], far[ok], normal[ok], shift[ok]
         found, there = self._flow(now.grey, before.grey, places, 0.5 * (near + far))
         again, back = self._flow(before.grey, now.grey, found, places)
-        tracked = there & back & (np.linalg.norm(again - places, axis=1) < RETURNS)
-        if tracked.sum() < FEWEST:
+        tracked = there & back & (np.linalg.norm(again - places, axis=1) < MAX_RETURN_ERROR)
+        if tracked.sum() < MIN_PLACES:
             return None
         share = float(np.median((np.sum((found - far) * normal, axis=1) / shift)[tracked]))
         return True if share > ATTACHED else False if share < APART else None

@@ -22,8 +22,8 @@ from perch_perception.line_mapping.straight import wires
 RED_LENGTH, PLAIN_LENGTH = 30.0, 80.0  # shorter arcs are no wires [px]
 TOLERANCE = 1.5  # of ridge points from their arc [px]
 SIGMA = 0.2  # error of an arc that averaging does not remove [px]
-MOST_GAP = 25.0  # hole after which an arc is another one [px]
-LEAST_WIDTH = 4.0  # the thickness of a thinner wire cannot be told [px]
+MAX_GAP = 25.0  # hole after which an arc is another one [px]
+MIN_WIDTH = 4.0  # the width of a thinner wire cannot be measured [px]
 SAMPLES = 7          # rays that stand for a sighting
 HYPOTHESES = 64      # arcs tried per blob and round
 MAX_BEND = 0.6       # second derivative of an arc: a wire bends no more [1/rad]
@@ -216,7 +216,7 @@ def _powers(t: np.ndarray) -> np.ndarray:
 def _pieces(ordered: np.ndarray, pixels: np.ndarray) -> list[np.ndarray]:
     """Indices of the points of each unbroken piece of an arc, in order along it."""
     steps = np.linalg.norm(np.diff(pixels[ordered], axis=0), axis=1)
-    pieces = np.split(ordered, np.nonzero(steps > MOST_GAP)[0] + 1)
+    pieces = np.split(ordered, np.nonzero(steps > MAX_GAP)[0] + 1)
     return [p for p in pieces if len(p) >= 2 * SAMPLES
             and np.linalg.norm(pixels[p[-1]] - pixels[p[0]]) >= RED_LENGTH]
 
@@ -248,4 +248,4 @@ def _width(edges: np.ndarray, camera: Camera) -> float:
     between = float(np.linalg.norm(np.cross(normals[0], normals[1])))
     looks = float(np.arcsin(min(between, 1.0)) * camera.fx)
     width = looks + WIDTH_LOSS - MEETING * np.exp((MEETING_AT - looks) / MEETING_OVER)
-    return float(width / camera.fx) if width >= LEAST_WIDTH else 0.0
+    return float(width / camera.fx) if width >= MIN_WIDTH else 0.0

@@ -20,13 +20,13 @@ from perch_perception.pose_buffer import BodyState
 
 BASELINE = 0.03  # motion between the sightings kept [m]
 TURN = 3.0  # or rotation between them [deg]
-MOST_OBSERVATIONS = 40  # sightings kept per wire
+MAX_OBSERVATIONS = 40  # sightings kept per wire
 FORGET_AFTER = 2.0  # a wire that was never triangulated and is not seen is dropped [s]
 STALE_AFTER, SUPERSEDED = 0.4, 0.3  # a wire not seen for so long gives way to one that is seen so close to it [s, m]
-MAX_RANGE = 8.0  # ends of wires further away are not believed [m]
+MAX_RANGE = 8.0  # ends of wires further away are not used [m]
 STRAIGHTNESS = 0.02  # a sagging wire is cut into chords that stay within this [m]
 PIECE_IDS = 1_000_000  # ids of the pieces of wire k: k, k + 1,000,000, ...
-CERTAIN = 3           # so many more images that show a line to be attached to what is beside it than apart: no wire
+ATTACHED_COUNT = 3    # surplus of images that show a line attached to the surface beside it: it is no wire
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
 
 
@@ -91,14 +91,14 @@ class LineMapper:
         for index in sorted(changed):
             self._triangulate(self._tracks[index])
         if attached is not None:
-            self._judge(seen, owners, attached)
+            self._count_attached(seen, owners, attached)
         self._merge()
         self._supersede(time)
         self._tracks = [t for t in self._tracks
-                        if (t.estimate is not None and t.attached < CERTAIN) or time - t.last.time <= FORGET_AFTER]
+                        if (t.estimate is not None and t.attached < ATTACHED_COUNT) or time - t.last.time <= FORGET_AFTER]
         return self.map(time)
 
-    def _judge(self, seen: Sequence[LineObservation], owners: Sequence[int | None],
+    def _count_attached(self, seen: Sequence[LineObservation], owners: Sequence[int | None],
                attached: Callable[[LineObservation, WireCurve], bool | None]) -> None:
         """Count for each observed wire the images that show it attached to the surface beside it, less those that do not."""
         for one, owner in zip(seen, owners):
@@ -114,7 +114,7 @@ class LineMapper:
         lines: list[MappedPowerline] = []
         missing: list[str] = []
         for track in self._tracks:
-            if track.count < MIN_OBSERVATIONS or track.attached >= CERTAIN:
+            if track.count < MIN_OBSERVATIONS or track.attached >= ATTACHED_COUNT:
                 continue
             if track.estimate is None:
                 missing.append(f"line {track.id}: {track.refusal}")
@@ -132,8 +132,8 @@ class LineMapper:
         if not moved and not elsewhere:
             return False
         track.observations.append(replace(one, width=0.0) if meets_another(self._tracks, track, one) else one)
-        if len(track.observations) > MOST_OBSERVATIONS:
-            track.observations = _thinned(track.observations)
+        if len(track.observations) > MAX_OBSERVATIONS:
+            track.observations = _drop_redundant(track.observations)
         return True
 
     def _triangulate(self, track: _Track) -> None:
@@ -171,8 +171,8 @@ class LineMapper:
                 kept.append(track)
                 continue
             merged = sorted(twin.observations + track.observations, key=lambda one: one.time)
-            while len(merged) > MOST_OBSERVATIONS:
-                merged = _thinned(merged)
+            while len(merged) > MAX_OBSERVATIONS:
+                merged = _drop_redundant(merged)
             twin.observations, twin.count, twin.attached = merged, twin.count + track.count, twin.attached + track.attached
             twin.last = max(twin.last, track.last, key=lambda one: one.time)
             self._triangulate(twin)
@@ -186,7 +186,7 @@ class LineMapper:
         fresh = [t for t in self._tracks if t.estimate is not None and t.extent is not None and t.count >= MIN_OBSERVATIONS
                  and time - t.last.time <= STALE_AFTER]
         self._tracks = [t for t in self._tracks if time - t.last.time <= STALE_AFTER
-                        or not any(other.observations[0].time > t.last.time and _beside(t, other, SUPERSEDED) for other in fresh)]
+                        or not any(other.observations[0].time > t.last.time and _is_adjacent(t, other, SUPERSEDED) for other in fresh)]
 
     def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedPowerline]:
         """Return the wire as chords that stay within `STRAIGHTNESS`; none, with the reason in `missing`, if too uncertain."""
@@ -205,7 +205,7 @@ class LineMapper:
             covariance = self._covariance(estimate, 0.5 * (a + b))
             sigma = largest_sigma(covariance)
             if sigma > self.settings.max_sigma:
-                missing.append(f"line {track.id}: known to {sigma:.2f} m only")
+                missing.append(f"line {track.id}: position uncertainty of {sigma:.2f} m is too large")
                 return []
             start, end = _chord(estimate.curve, a, b, radius, self._corrected).ends
             lines.append(MappedPowerline(track.id + PIECE_IDS * k, tuple(start.tolist()), tuple(end.tolist()), radius, covariance,
@@ -235,7 +235,7 @@ def _chord(curve: WireCurve, a: float, b: float, radius: float, offset: np.ndarr
     return Segment.between(curve.at(a) + shift, curve.at(b) + shift, radius)
 
 
-def _thinned(observations: list[LineObservation]) -> list[LineObservation]:
+def _drop_redundant(observations: list[LineObservation]) -> list[LineObservation]:
     """Return the sightings without the one whose neighbours are nearest to each other, which keeps the baseline."""
     centres = np.array([o.p_WC for o in observations])
     gaps = np.linalg.norm(centres[2:] - centres[:-2], axis=1)
@@ -245,10 +245,10 @@ def _thinned(observations: list[LineObservation]) -> list[LineObservation]:
 
 def _same_wire(a: _Track, b: _Track) -> bool:
     """Whether two triangulated wires coincide: within 6 cm where the second was seen, and 3 deg."""
-    return _beside(a, b, 0.06)
+    return _is_adjacent(a, b, 0.06)
 
 
-def _beside(a: _Track, b: _Track, distance: float) -> bool:
+def _is_adjacent(a: _Track, b: _Track, distance: float) -> bool:
     """Whether two triangulated wires run together: within a distance [m] where the second was seen, and 3 deg."""
     if a.estimate is None or b.estimate is None or b.extent is None:
         return False

@@ -25,15 +25,15 @@ from perch_perception.line_mapping.observation import LineObservation
 MIN_RATIO = 0.03   # least sigma2/sigma1 of the planes' normals; below it the depth is not determined
 POSE_POSITION, POSE_ROTATION = 0.006, np.radians(0.1)  # 1 sigma of the camera's pose from image to image [m, rad]
 SAG = 0.03         # prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m) [1/m]
-WIDTH = 0.01       # error of a wire's width in an image, beside that of its edges: share of it
-WIDTH_EDGES = 0.3  # error of a wire's edges in an image beside that of its rays: share of it
+WIDTH_ERROR = 0.01      # error of a wire's width in an image, beside that of its edges: share of it
+WIDTH_EDGE_ERROR = 0.3  # error of a wire's edges in an image beside that of its rays: share of it
 RIGID_ITERATIONS = 6   # first fit, as if the odometry did not drift: it shows which sightings do not belong to the wire
 ITERATIONS = 2         # from there, or from an earlier result; the next sighting brings the next two
 HUBER = 2.5            # residuals beyond this many sigma count linearly
-HARDLY = 0.05          # a wire known worse than this is fitted anew, as if nothing had been known [m]
+MAX_PRIOR_SIGMA = 0.05  # an earlier result that is less certain is not used as a prior [m]
 GATE = 4.0             # widths farther off than so many sigma are not this wire's
 WIDTH_GATE = 0.08      # error of the distance, 1 sigma, before there is an earlier result [m]
-ALL = PARAMETERS + 4   # the wire, the camera's mount, the logarithm of the radius
+UNKNOWNS = PARAMETERS + 4  # the wire, the camera's mount, the logarithm of the radius
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def intersect_planes(observations: Sequence[LineObservation]) -> WireCurve:
         Undetermined: fewer than two sightings, or planes that are nearly the same.
     """
     if len(observations) < 2:
-        raise Undetermined("seen once only")
+        raise Undetermined("only one sighting")
     normals = np.array([o.normal for o in observations])
     centres = np.array([o.p_WC for o in observations])
     _, sizes, axes = np.linalg.svd(normals)
@@ -133,8 +133,8 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
     used = np.ones(len(observations), bool)
     drifted = _drifted(observations, settings)
     rigid, rounds = np.zeros(len(used)), RIGID_ITERATIONS if before is None else 0
-    known, newest = _before(observations, before)
-    if known > HARDLY**2:  # it would take whatever comes
+    known, newest = _prior_of(observations, before)
+    if known > MAX_PRIOR_SIGMA**2:  # it would take whatever comes
         known, newest = 0.0, -1
     for number, walk in enumerate([rigid] * rounds + [drifted] * ITERATIONS):
         walked = np.cumsum(walk)
@@ -147,11 +147,11 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
         weight = np.where(used, np.minimum(1.0, HUBER / np.maximum(misfit, 1e-9)), 0.0)
         by_rays = _normal_equations(_whitened(curve, mount, observations, centres, rays, rigid), weight)
         by_widths = _normal_equations(widths, weight)
-        information, gradient = _wandering(by_rays, by_widths, walk, settings, curve.curvature, mount)
+        information, gradient = _information_filter(by_rays, by_widths, walk, settings, curve.curvature, mount)
         try:
             step = -np.linalg.solve(information, gradient)
         except np.linalg.LinAlgError:  # the sightings that are left say nothing of one direction
-            raise Undetermined("the sightings that agree are from places too much alike") from None
+            raise Undetermined("the viewpoints of the consistent sightings are too similar") from None
         step[:4] *= min(1.0, 0.5 / max(np.abs(step[:4]).max(), 1e-12))
         curve, mount, size = curve.moved(step[:PARAMETERS]), mount + step[PARAMETERS:-1], size + step[-1]
     if np.mean(curve.offsets(centres, rays).ahead > 0) < 0.9 or not np.all(np.isfinite(curve.point)):
@@ -162,7 +162,7 @@ def triangulate(observations: Sequence[LineObservation], settings: Triangulation
     return WireEstimate(curve, covariance, used, mount, float(np.exp(size)), observations[-1].time)
 
 
-def _before(observations: Sequence[LineObservation], before: WireEstimate | None) -> tuple[float, int]:
+def _prior_of(observations: Sequence[LineObservation], before: WireEstimate | None) -> tuple[float, int]:
     """Return the variance of an earlier result's place [m^2], and the index of the last sighting that it includes."""
     if before is None:
         return 0.0, -1
@@ -184,7 +184,7 @@ def _normal_equations(linear: tuple[np.ndarray, np.ndarray], weight: np.ndarray)
     return np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian), np.einsum("n,nki,nk->ni", weight, jacobian, residual)
 
 
-def _wandering(by_rays, by_widths, walk, settings, curvature, mount):
+def _information_filter(by_rays, by_widths, walk, settings, curvature, mount):
     """Return information (9, 9) and gradient (9,) of the wire after the last sighting, the camera's mount and the radius.
 
     An information filter runs from the oldest sighting to the newest. Before each, the odometry's random walk W = walk G G'
@@ -226,7 +226,7 @@ def _widths(curve, size, observations, apart):
     A width whose distance differs by more than the variance `apart` (n,) [m^2] allows belongs to two wires that meet in the
     image, or to a part of one wire: its sighting's rays do not point to a wire's axis either.
     """
-    residual, jacobian = np.zeros((len(observations), 1)), np.zeros((len(observations), 1, ALL))
+    residual, jacobian = np.zeros((len(observations), 1)), np.zeros((len(observations), 1, UNKNOWNS))
     one_wire = np.ones(len(observations), bool)
     width, ray = np.array([(o.width, o.sigma) for o in observations]).T
     seen = np.flatnonzero(width > 0.0)
@@ -236,7 +236,7 @@ def _widths(curve, size, observations, apart):
     to, s = _feet(curve, [observations[k] for k in seen])
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
     misfit = np.log(np.sin(0.5 * width) * distance) - size
-    sigma = np.sqrt(WIDTH**2 + (WIDTH_EDGES * ray / width) ** 2 + (POSE_POSITION / distance) ** 2)
+    sigma = np.sqrt(WIDTH_ERROR**2 + (WIDTH_EDGE_ERROR * ray / width) ** 2 + (POSE_POSITION / distance) ** 2)
     x, y = (to @ curve.axes[:, :2] / distance[:, None] ** 2).T
     zero = np.zeros_like(s)
     rows = np.stack([x, y, s * x, s * y, 0.5 * s * s * y, zero, zero, zero, zero - 1.0], axis=1) / sigma[:, None]

@@ -18,7 +18,7 @@ from perch_perception.tags.view import VirtualView
 SEARCH_WINDOWS = ((7, 12.0), (31, 7.0))  # threshold windows [px] and how much darker than its mean a tag is [grey values], one per search
 VIEW_TAG_SIDE = 60.0          # wanted side of a tag in a virtual view [px]
 VIEW_WINDOW = 11              # threshold window there: 1.5 modules of the tag [px]
-VIEW_LEAST = 0.1              # perimeter of what may be a tag there, as a share of the view's side: a tenth of a tag's. What is
+VIEW_MIN_PERIMETER = 0.1      # perimeter of what may be a tag there, as a share of the view's side: a tenth of a tag's. What is
                               # smaller is texture, and looking at it took three quarters of the time
 CUT = 2                       # what dark squares that touch at their corners lose on each side, so that they come apart [px]
 
@@ -44,7 +44,7 @@ class TagDetector:
     def __init__(self, board: TagBoard, camera: Camera) -> None:
         self.board, self.camera = board, camera
         self._search = [_detector(board, *window) for window in SEARCH_WINDOWS]
-        self._view = _detector(board, VIEW_WINDOW, least=VIEW_LEAST)
+        self._view = _detector(board, VIEW_WINDOW, least=VIEW_MIN_PERIMETER)
 
     def search(self, image: np.ndarray, turn: int | None = None) -> Detection:
         """Detect tags in the whole frame, enlarged twice.
@@ -62,7 +62,7 @@ class TagDetector:
         # cv2.resize maps the centre u of a pixel to 2 u + 0.5
         return self._select([((corners - 0.5) / 2.0, ids) for corners, ids in found])
 
-    def look(self, image: np.ndarray, view: VirtualView, origin: tuple[int, int] = (0, 0)) -> Detection:
+    def detect_in_view(self, image: np.ndarray, view: VirtualView, origin: tuple[int, int] = (0, 0)) -> Detection:
         """Detect tags in a virtual view of the image (mono8), or of the part of it that begins at `origin` (column, row).
 
         Corners are returned in pixels of the camera.

@@ -27,14 +27,14 @@ from perch_perception.tags.view import VirtualView
 SEARCH_PERIOD = 0.1  # between searches of the whole frame, 10 ms each [s]
 LOST_AFTER = 0.4   # tracking without a tag before searching [s]
 MIN_RANGE = 0.15   # a nearer board is taken for one of another size [m]
-FOLLOW_IMAGES = 4  # in a row in which the expected corners are measured without reading the tags' numbers
+MAX_TRACKED_IMAGES = 4  # in a row in which the expected corners are measured without reading the tags' numbers
 VIEW_MARGIN = 1.2  # what is looked at around the pad, in pad sizes
 PRINT_SIGMA = 0.0002  # of a tag's place on the board, per axis: what plotters and careful gluing keep [m]
-FOLLOW_GAP = 0.1      # time since the last sighting over which corners are expected well enough [s]
-FOLLOW_TAGS = 3       # so many tags must be expected: their agreement shows that nothing else was measured
+MAX_TRACK_GAP = 0.1   # time since the last sighting over which corners are expected well enough [s]
+MIN_TRACKED_TAGS = 3  # so many tags must be expected: their agreement shows that nothing else was measured
 EXPECTED_MARGIN = 6.0  # an expected corner this near to the border may be outside [px]
 AROUND_VIEW = 12      # what is looked at beyond the view: profiles across edges at its border [px]
-CLEAR = 50.0          # chi^2 to the second-best pose of a sighting that can be followed
+MIN_BRANCH_GAP = 50.0  # chi^2 to the second-best pose of a sighting that can be tracked
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class BoardLocalizer:
         self._last_time = -np.inf                 # ... and when
         self._search_time = -np.inf
         self._searches = 0
-        self._followed = 0                        # images since the numbers were read
+        self._tracked_images = 0                  # images since the numbers were read
 
     def process(self, image: np.ndarray | Callable[[Region], np.ndarray], time: float, body: BodyState | None = None) -> Localization:
         """Localise the board.
@@ -112,14 +112,14 @@ class BoardLocalizer:
             p_CS, R_CS = self._predict(last, body)
             view = self._aim(p_CS, self._radius)
             part = _Part.of(image, view.region(self.mount.camera, AROUND_VIEW))
-            followed = self._follow(part, time, body, p_CS, R_CS) if last.branch_gap >= CLEAR else None
-            if followed is None:
-                self._followed = 0
-            result = followed or self._attempt(part, self._look(part, view), (p_CS, R_CS), False)
+            tracked = self._track(part, time, body, p_CS, R_CS) if last.branch_gap >= MIN_BRANCH_GAP else None
+            if tracked is None:
+                self._tracked_images = 0
+            result = tracked or self._attempt(part, self._detect_in_view(part, view), (p_CS, R_CS), False)
         elif time - self._search_time < SEARCH_PERIOD - 1e-3:
             return Localization(None, message="waiting for the next search")
         else:
-            self._search_time, self._followed = time, 0
+            self._search_time, self._tracked_images = time, 0
             camera = self.mount.camera
             whole = _Part.of(image, (slice(0, camera.height), slice(0, camera.width)))
             result = self._attempt(whole, self._search(whole), None, True)
@@ -135,29 +135,29 @@ class BoardLocalizer:
         except LocalizationRefusal as refusal:
             return Localization(None, searched=searched, message="; ".join([str(refusal), *detection.rejected]))
 
-    def _follow(self, part: _Part, time: float, body: BodyState | None, p_CS: np.ndarray,
+    def _track(self, part: _Part, time: float, body: BodyState | None, p_CS: np.ndarray,
                 R_CS: np.ndarray) -> Localization | None:
         """Measure the corners where they are expected; None where this is not reliable, or where a corner is not found."""
-        if (self._followed >= FOLLOW_IMAGES or body is None or self._last_body is None
-                or time - self._last_time > FOLLOW_GAP):
+        if (self._tracked_images >= MAX_TRACKED_IMAGES or body is None or self._last_body is None
+                or time - self._last_time > MAX_TRACK_GAP):
             return None
         pixels, valid = self.mount.camera.project(self.board.corners_S @ R_CS.T + p_CS)
         inside = np.all(valid & self.mount.camera.contains(pixels, margin=EXPECTED_MARGIN), axis=1)
         ids = tuple(number for number, seen in zip(self.board.ids, inside) if seen)
-        if len(ids) < FOLLOW_TAGS:
+        if len(ids) < MIN_TRACKED_TAGS:
             return None
         try:
             result = self._solve(part, Detection(ids, pixels[inside]), (p_CS, R_CS), False, start=(p_CS, R_CS))
         except LocalizationRefusal:
             return None
         if result.message:
-            return None  # an edge was not found, or tags disagree: look properly
-        self._followed += 1
+            return None  # an edge was not found, or tags disagree: detect them again
+        self._tracked_images += 1
         return result
 
     def _search(self, whole: _Part) -> Detection:
         """Search the frame, then detect tags again in a virtual view around those found, which may show more."""
-        first = self._distinct(self._detector.search(whole.pixels, self._searches))
+        first = self._resolve_duplicates(self._detector.search(whole.pixels, self._searches))
         self._searches += 1
         if not first.ids:
             return first
@@ -168,12 +168,12 @@ class BoardLocalizer:
         seen = [self.board.ids.index(number) for number in first.ids]
         centre_S = self.board.corners_S[seen].reshape(-1, 3).mean(axis=0)
         radius = float(np.linalg.norm(self.board.corners_S - centre_S, axis=-1).max())
-        closer = self._distinct(self._look(whole, self._aim(distance * direction / np.linalg.norm(direction), radius)))
+        closer = self._resolve_duplicates(self._detect_in_view(whole, self._aim(distance * direction / np.linalg.norm(direction), radius)))
         best = closer if len(closer.ids) >= len(first.ids) else first
         rejected = tuple(dict.fromkeys(first.rejected + closer.rejected))
         return Detection(best.ids, best.corners, rejected)
 
-    def _distinct(self, detection: Detection, expected: tuple[np.ndarray, np.ndarray] | None = None) -> Detection:
+    def _resolve_duplicates(self, detection: Detection, expected: tuple[np.ndarray, np.ndarray] | None = None) -> Detection:
         """Keep each tag once: of several sightings the one that agrees with the others, or with the board's expected pose."""
         twice = sorted({i for i in detection.ids if detection.ids.count(i) > 1})
         if not twice:
@@ -183,8 +183,8 @@ class BoardLocalizer:
         notes = tuple(f"tag {i} is seen {detection.ids.count(i)} times" for i in twice)
         return Detection(tuple(detection.ids[k] for k in chosen), detection.corners[chosen], detection.rejected + notes)
 
-    def _look(self, part: _Part, view: VirtualView) -> Detection:
-        return self._detector.look(part.pixels, view, part.origin)
+    def _detect_in_view(self, part: _Part, view: VirtualView) -> Detection:
+        return self._detector.detect_in_view(part.pixels, view, part.origin)
 
     def _aim(self, p_CS: np.ndarray, radius: float) -> VirtualView:
         """Return the view of the board's expected surroundings, `radius` [m] around p_CS."""
@@ -213,7 +213,7 @@ class BoardLocalizer:
         """
         if not detection.ids:
             raise LocalizationRefusal("no tag of the board found")
-        detection, camera = self._distinct(detection, expected), self.mount.camera
+        detection, camera = self._resolve_duplicates(detection, expected), self.mount.camera
         notes, ids = list(detection.rejected), detection.ids
         if not ids:
             raise LocalizationRefusal("no tag of the board that is seen once")

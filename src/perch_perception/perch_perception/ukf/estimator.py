@@ -19,17 +19,17 @@ from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.ukf.measurement import Estimate, Health, Status, VioOutcome, VioPose
-from perch_perception.ukf.rest import rested, stopped
-from perch_perception.ukf.stillness import WINDOW, still, window
+from perch_perception.ukf.rest import after_rest, after_stop
+from perch_perception.ukf.stillness import WINDOW, is_at_rest, window
 from perch_perception.ukf.unscented import GATES, Belief, CovarianceError, Innovation, UnscentedTransform
 
 _HISTORY = 0.5  # IMU kept for replay: VIO is late by 0.04 s, by 0.08 s in the campaign on robustness [s]
-_PATIENCE = 15  # rejections in a row after which VIO is believed to have jumped
+_MAX_CONSECUTIVE_REJECTIONS = 15  # rejections in a row after which VIO is taken to have jumped
 _LOST_POSITION = 2.0  # 1 sigma beyond which the state is not to be used [m]
 _LOST_ATTITUDE = 0.6  # the same [rad]
 COVARIANCE_STRIDE = 5  # IMU steps per update of the published covariance
-_FUTURE = 50_000_000  # VIO stamps so far ahead wait for the IMU, later ones are refused [ns]
-_MOST_WAITING = 20  # poses ahead of the IMU that are kept
+_MAX_STAMP_LEAD = 50_000_000  # VIO stamps so far ahead wait for the IMU, later ones are refused [ns]
+_MAX_WAITING = 20  # poses ahead of the IMU that are kept
 
 
 class Estimator:
@@ -44,7 +44,7 @@ class Estimator:
         self._transform = UnscentedTransform(config)
         self._imu = ImuBuffer(config.imu, _HISTORY)
         self._base: Belief | None = None  # at the stamp of the last applied pose, or of rest
-        self._heard = self._applied = 0   # newest stamp of any pose, and of an applied one [ns]
+        self._newest_vio_stamp = self._applied = 0   # newest stamp of any pose, and of an applied one [ns]
         self._resting = False             # the base is one of rest
         self._live: Belief | None = None  # covariance up to a few steps ago
         self._anchors: list[Belief] = []  # where a replay can begin: the base and, without VIO for long, later beliefs
@@ -52,9 +52,9 @@ class Estimator:
         self._lag = 0
         self._waiting: list[VioPose] = []
         self._refused_in_row = 0
-        self._accepted = self._rejected = self._breaks = 0
+        self._accepted = self._rejected = self._divergences = 0
         self._nis = 0.0
-        self._broken = False
+        self._diverged = False
         self._message = "waiting for the IMU"
         self._compile()
 
@@ -83,7 +83,7 @@ class Estimator:
             try:
                 outcome = self._apply(pose) if self._base is not None else self._begin(pose)
             except CovarianceError as error:
-                self._break(str(error))
+                self._diverge(str(error))
                 return VioOutcome.BROKEN
         if outcome is VioOutcome.GATED:
             self._rejected += 1
@@ -114,7 +114,7 @@ class Estimator:
     def status(self) -> Status:
         """Health and diagnostics of the estimator."""
         age, position, attitude = math.inf, math.inf, math.inf
-        health = Health.DIVERGED if self._broken else Health.INITIALISING
+        health = Health.DIVERGED if self._diverged else Health.INITIALISING
         if self._live is not None:
             age = (self._imu.newest.stamp - self._applied) * 1e-9
             diagonal = np.diag(self._live.P)
@@ -122,7 +122,7 @@ class Estimator:
             attitude = float(np.sqrt(diagonal[at.D_ATTITUDE].max()))
             lost = position > _LOST_POSITION or attitude > _LOST_ATTITUDE
             health = Health.DIVERGED if lost else Health.COASTING if age > self.config.coasting_after else Health.RUNNING
-        return Status(health, age, self._accepted, self._rejected, self._breaks, self._nis, position, attitude, self._message)
+        return Status(health, age, self._accepted, self._rejected, self._divergences, self._nis, position, attitude, self._message)
 
     def _compile(self) -> None:
         """Run the compiled functions once: their first compilation takes seconds, which must not happen in flight."""
@@ -139,15 +139,15 @@ class Estimator:
         last = self._imu.last
         if last is None:
             return VioOutcome.NO_IMU
-        self._heard = max(self._heard, min(pose.stamp, last.stamp))
+        self._newest_vio_stamp = max(self._newest_vio_stamp, min(pose.stamp, last.stamp))
         if self._base is not None and pose.stamp <= self._base.stamp:
             return VioOutcome.DUPLICATE if pose.stamp == self._base.stamp else VioOutcome.OUT_OF_ORDER
         if pose.stamp > last.stamp:
-            if pose.stamp > last.stamp + _FUTURE:
+            if pose.stamp > last.stamp + _MAX_STAMP_LEAD:
                 return VioOutcome.FUTURE
             if any(w.stamp == pose.stamp for w in self._waiting):
                 return VioOutcome.DUPLICATE
-            if len(self._waiting) >= _MOST_WAITING:
+            if len(self._waiting) >= _MAX_WAITING:
                 return VioOutcome.FUTURE
             self._waiting = sorted([*self._waiting, pose], key=lambda w: w.stamp)
             return VioOutcome.WAITING
@@ -157,8 +157,8 @@ class Estimator:
 
     def _begin(self, pose: VioPose) -> VioOutcome:
         steps = window(self._imu, pose.stamp)
-        self._settle(start.from_pose(self.config, pose, steps) if pose.inertial is None else start.from_state(pose, pose.inertial))
-        self._broken = False
+        self._set_base(start.from_pose(self.config, pose, steps) if pose.inertial is None else start.from_state(pose, pose.inertial))
+        self._diverged = False
         return VioOutcome.STARTED
 
     def _apply(self, pose: VioPose) -> VioOutcome:
@@ -168,20 +168,20 @@ class Estimator:
         self._nis = innovation.nis
         if innovation.nis > GATES[len(innovation.residual)]:
             self._refused_in_row += 1
-            if self._refused_in_row < _PATIENCE:
+            if self._refused_in_row < _MAX_CONSECUTIVE_REJECTIONS:
                 return VioOutcome.GATED
-            prior, outcome = self._jumped(prior, innovation), VioOutcome.JUMPED
+            prior, outcome = self._inflated(prior, innovation), VioOutcome.JUMPED
             innovation = self._innovate(prior, pose)
-        self._settle(self._transform.correct(prior, innovation) if pose.inertial is None else start.from_state(pose, pose.inertial))
+        self._set_base(self._transform.correct(prior, innovation) if pose.inertial is None else start.from_state(pose, pose.inertial))
         return outcome
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
-        R = pose.covariance + start.white(self.config.vio)
+        R = pose.covariance + start.added_noise(self.config.vio)
         if pose.velocity_covariance is not None:
             R = block_diag(R, pose.velocity_covariance)
         return self._transform.innovate(prior, pose, R)
 
-    def _jumped(self, prior: Belief, innovation: Innovation) -> Belief:
+    def _inflated(self, prior: Belief, innovation: Innovation) -> Belief:
         """Return the prior with a covariance enlarged by the residual: position, attitude, and the velocity that explains it."""
         assert self._base is not None
         elapsed = max((prior.stamp - self._base.stamp) * 1e-9, 0.1)
@@ -189,7 +189,7 @@ class Estimator:
         extra = np.repeat([p, p / elapsed**2, theta, 0.0, 0.0], 3)
         return dataclasses.replace(prior, P=prior.P + np.diag(extra))
 
-    def _settle(self, belief: Belief) -> None:
+    def _set_base(self, belief: Belief) -> None:
         """Make a belief the new base, and predict the live state from there to the newest IMU stamp."""
         self._base, self._refused_in_row, self._anchors = belief, 0, [belief]
         now = self._imu.newest.stamp
@@ -202,23 +202,24 @@ class Estimator:
         Skipped while VIO poses arrive: VIO applies rest itself, or measures the pose at rest.
         """
         now, config = self._imu.newest.stamp, self.config
-        if self._base is None or self._live is None or now - max(self._heard, self._base.stamp) < round(1e9 * config.coasting_after):
+        if self._base is None or self._live is None or now - max(self._newest_vio_stamp, self._base.stamp) < round(
+                1e9 * config.coasting_after):
             return
-        if not still(window(self._imu, now), self._base.x[10:16], np.diag(self._live.P)[9:15]):
+        if not is_at_rest(window(self._imu, now), self._base.x[10:16], np.diag(self._live.P)[9:15]):
             self._resting = False
             return
         belief, middle = self._base, now - round(0.5e9 * WINDOW)
         try:
             if not self._resting:
                 begin = max(belief.stamp, 2 * middle - now)
-                halted = stopped(self._transform.predict(belief, self._imu.run(belief.stamp, begin), begin))
-                if halted is None:
+                stopped = after_stop(self._transform.predict(belief, self._imu.run(belief.stamp, begin), begin))
+                if stopped is None:
                     return
-                belief = halted
+                belief = stopped
             self._resting = True
-            self._settle(rested(belief, self._imu.run(belief.stamp, middle), middle, config))
+            self._set_base(after_rest(belief, self._imu.run(belief.stamp, middle), middle, config))
         except CovarianceError as error:
-            self._break(str(error))
+            self._diverge(str(error))
 
     def _refresh(self) -> None:
         """Propagate the published covariance to the newest IMU stamp, and keep anchors for a replay of the IMU history."""
@@ -227,18 +228,18 @@ class Estimator:
         try:
             self._live = live = self._transform.predict(live, self._imu.run(live.stamp, now), now)
         except CovarianceError as error:
-            self._break(str(error))
+            self._diverge(str(error))
             return
         self._lag = 0
         if not np.isfinite(self._x).all():
-            self._break("state is not finite")
+            self._diverge("state is not finite")
             return
         half = round(0.5e9 * _HISTORY)
         if now - self._anchors[-1].stamp >= half:
             self._anchors = [a for a in self._anchors if a.stamp >= now - 2 * half] + [live]
 
-    def _break(self, why: str) -> None:
+    def _diverge(self, why: str) -> None:
         """Discard the state after a divergence; the next VIO pose restarts the filter."""
         self._base = self._live = None
-        self._anchors, self._breaks = [], self._breaks + 1
-        self._broken, self._message = True, f"diverged: {why}; waiting for VIO to start again"
+        self._anchors, self._divergences = [], self._divergences + 1
+        self._diverged, self._message = True, f"diverged: {why}; waiting for VIO to start again"

@@ -15,13 +15,13 @@ _GAP = 3.0  # longest interval between samples that counts as complete, in perio
 _GAP_ACCEL = 5.0  # 1 sigma of what a missing sample may have been [m/s^2]
 _GAP_GYRO = 2.0  # the same [rad/s]
 _PERIODS = 9  # last intervals whose median is the period
-_ABSURD = 1e8  # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
+_MAX_SQUARE = 1e8  # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
 
 
 def is_sane(sample: ImuSample) -> bool:
     """Whether a sample is finite and within the range of any real IMU."""
     (a, b, c), (x, y, z) = sample.w_B, sample.f_B
-    return a * a + b * b + c * c + x * x + y * y + z * z < _ABSURD
+    return a * a + b * b + c * c + x * x + y * y + z * z < _MAX_SQUARE
 
 
 class ImuOutcome(enum.Enum):

@@ -25,7 +25,7 @@ class VioOutcome(enum.Enum):
     TOO_OLD = "refused: older than the IMU history"
     FUTURE = "refused: stamp lies too far in the future"
     NOT_FINITE = "refused: not finite"
-    BAD_COVARIANCE = "refused: covariance is not positive semi-definite, or senselessly large"
+    BAD_COVARIANCE = "refused: covariance is not positive semi-definite, or too large"
     NO_IMU = "refused: no IMU data yet"
 
     @property
@@ -89,14 +89,14 @@ class VioPose:
         return None if all(_is_covariance(np.ascontiguousarray(C)) for C in covariances) else VioOutcome.BAD_COVARIANCE
 
 
-_LARGEST = 1e8  # a variance beyond that says nothing, and its square would not be a number [m^2, rad^2, ...]
+_MAX_VARIANCE = 1e8  # larger variances carry no information, and their squares would overflow [m^2, rad^2, ...]
 
 
 @compiled
 def _is_covariance(C):
-    """Whether a matrix is symmetric and positive semi-definite, up to rounding, and no element exceeds `_LARGEST`."""
+    """Whether a matrix is symmetric and positive semi-definite, up to rounding, and no element exceeds `_MAX_VARIANCE`."""
     scale = np.abs(C).max()
-    if scale > _LARGEST:
+    if scale > _MAX_VARIANCE:
         return False
     if np.abs(C - C.T).max() > 1e-5 * scale + 1e-15:
         return False

@@ -19,7 +19,7 @@ from perch_perception.ukf.stillness import REST_VELOCITY
 from perch_perception.ukf.unscented import ACCEL, DT, GATES, GYRO, Belief, Innovation, UnscentedTransform
 
 
-def stopped(belief: Belief) -> Belief | None:
+def after_stop(belief: Belief) -> Belief | None:
     """Return the belief after a first zero-velocity update; None where its velocity is not consistent with zero."""
     H = np.zeros((3, at.ERROR_SIZE))
     H[:, at.D_VELOCITY] = np.eye(3)
@@ -27,7 +27,7 @@ def stopped(belief: Belief) -> Belief | None:
     return UnscentedTransform.correct(belief, innovation) if innovation.nis < GATES[3] else None
 
 
-def rested(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> Belief:
+def after_rest(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> Belief:
     """Return the belief of a vehicle at rest over IMU steps (m, 9), m > 0, at their end `stamp` [ns]."""
     imu, x, P = config.imu, belief.x.copy(), belief.P.copy()
     T, d = float(steps[:, DT].sum()), np.arange(3)
@@ -41,9 +41,9 @@ def rested(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> 
     H[:3, at.D_GYRO_BIAS] = H[3:, at.D_ACCEL_BIAS] = np.eye(3)
     H[3:, at.D_ATTITUDE] = so3.hat(up_B)
     residual = np.concatenate([steps[:, GYRO].mean(axis=0) - x[at.GYRO_BIAS], steps[:, ACCEL].mean(axis=0) - x[at.ACCEL_BIAS] - up_B])
-    still = Belief(stamp, x, P)
+    resting = Belief(stamp, x, P)
     variance = np.repeat([imu.gyro_noise_density**2, imu.accel_noise_density**2], 3) / T
-    return UnscentedTransform.correct(still, _innovation(still, H, residual, variance))
+    return UnscentedTransform.correct(resting, _innovation(resting, H, residual, variance))
 
 
 def _innovation(belief: Belief, H: np.ndarray, residual: np.ndarray, variance: np.ndarray) -> Innovation:

@@ -23,12 +23,12 @@ from perch_perception.ukf.unscented import ACCEL, ACCEL_VARIANCE, DT, GYRO, GYRO
 
 WINDOW = 0.2           # IMU over which rest is judged [s]
 REST_VELOCITY = 0.002  # 1 sigma of the velocity at rest [m/s]
-MOST_GYRO_BIAS, MOST_ACCEL_BIAS = 0.35, 1.5  # largest turn-on biases of MEMS sensors: 20 deg/s, 150 mg [rad/s, m/s^2]
-_ENERGY = 1.8   # most of T / 6: 1 is rest
-_LEAST = 10     # samples
-_ENTIRE = 0.9   # share of the window that must be there
-_LATEST = 4     # part of the window, its last, that must look like rest as well: a departure has just begun
-_CERTAIN = 6.0  # sigma of a mean that still is taken for zero
+MAX_GYRO_BIAS, MAX_ACCEL_BIAS = 0.35, 1.5  # largest turn-on biases of MEMS sensors: 20 deg/s, 150 mg [rad/s, m/s^2]
+_MAX_ENERGY = 1.8     # of T / 6: 1 is rest
+_MIN_SAMPLES = 10
+_MIN_COVERAGE = 0.9   # share of the window that the samples must span
+_LAST_PART = 4        # part of the window, its last, that must look like rest as well: a departure has just begun
+_MEAN_GATE = 6.0      # sigma up to which a mean counts as zero
 
 
 def energy(steps: np.ndarray) -> float:
@@ -39,31 +39,31 @@ def energy(steps: np.ndarray) -> float:
     return float(T) / (6 * (len(steps) - 1))
 
 
-def still(steps: np.ndarray, biases: np.ndarray | None = None, variance: np.ndarray | None = None,
-          seen: bool = False) -> bool:
+def is_at_rest(steps: np.ndarray, biases: np.ndarray | None = None, variance: np.ndarray | None = None,
+               image_is_static: bool = False) -> bool:
     """Whether IMU steps are those of a vehicle at rest.
 
     Args:
         steps: as from `ImuBuffer.run`, shape (m, 9).
         biases: of gyro and accelerometer [rad/s, m/s^2], shape (6,); None: unknown.
         variance: of the biases, shape (6,); None: the largest turn-on biases are assumed.
-        seen: the camera images show no motion: vibration, e.g. of the rotors, then does not exclude rest.
+        image_is_static: the camera images show no motion: vibration, e.g. of the rotors, then does not exclude rest.
     """
-    if len(steps) < _LEAST or steps[:, DT].sum() < _ENTIRE * WINDOW:
+    if len(steps) < _MIN_SAMPLES or steps[:, DT].sum() < _MIN_COVERAGE * WINDOW:
         return False
-    known = np.array([MOST_GYRO_BIAS, MOST_ACCEL_BIAS]) if variance is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
+    known = np.array([MAX_GYRO_BIAS, MAX_ACCEL_BIAS]) if variance is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
     sigma = np.sqrt(np.median(steps[:, [GYRO_VARIANCE, ACCEL_VARIANCE]], axis=0))  # of a whole sample: the first and last are cut
-    off = _beyond(steps, biases, known)
-    if not seen and energy(steps) + float(((off / sigma) ** 2).sum()) / 6.0 > _ENERGY:
+    off = _excess_means(steps, biases, known)
+    if not image_is_static and energy(steps) + float(((off / sigma) ** 2).sum()) / 6.0 > _MAX_ENERGY:
         return False
     spread = np.maximum(sigma, steps[:, 1:7].std(axis=0).reshape(2, 3).max(axis=1))
-    latest = steps[-max(len(steps) // _LATEST, 2):]
-    if (seen or biases is None) and (off > _CERTAIN * spread / np.sqrt(len(steps))).any():
+    latest = steps[-max(len(steps) // _LAST_PART, 2):]
+    if (image_is_static or biases is None) and (off > _MEAN_GATE * spread / np.sqrt(len(steps))).any():
         return False
-    return bool((_beyond(latest, biases, known) < _CERTAIN * spread / np.sqrt(len(latest))).all())
+    return bool((_excess_means(latest, biases, known) < _MEAN_GATE * spread / np.sqrt(len(latest))).all())
 
 
-def _beyond(steps: np.ndarray, biases: np.ndarray | None, known: np.ndarray) -> np.ndarray:
+def _excess_means(steps: np.ndarray, biases: np.ndarray | None, known: np.ndarray) -> np.ndarray:
     """Return by how much the mean gyro and accelerometer readings deviate from rest beyond the bias bounds `known`, each (2,)."""
     mean = steps[:, 1:7].mean(axis=0) - (0.0 if biases is None else biases)
     return np.maximum(np.abs([np.linalg.norm(mean[:3]), np.linalg.norm(mean[3:]) - GRAVITY]) - known, 0.0)

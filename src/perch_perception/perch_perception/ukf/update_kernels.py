@@ -15,7 +15,7 @@ from perch_perception.ukf.kernels import cholesky, moved, rotation_vector
 
 
 @compiled
-def _seen(x, back, z):
+def _predict_measurement(x, back, z):
     """Write the predicted measurement of state x (16,) to z, (6,) or (9,), its attitude relative to the inverse of `back`."""
     q = (x[6], x[7], x[8], x[9])
     turn = rotation_vector(quaternion_product(q, back))
@@ -60,7 +60,7 @@ def innovate(x, P, measured, R, scale, wm0, wc0, wi, residual, S, gain):
     back = (-x[6], -x[7], -x[8], x[9])
     for s in range(2 * n + 1):
         moved(x, 0.0 if s == 0 else (1.0 if s <= n else -1.0), columns[(s - 1) % n], y)
-        _seen(y, back, Z[s])
+        _predict_measurement(y, back, Z[s])
     turn = rotation_vector(quaternion_product((measured[3], measured[4], measured[5], measured[6]), back))
     for i in range(m):
         mean = wm0 * Z[0, i]

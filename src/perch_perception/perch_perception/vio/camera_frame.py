@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from perch_core import so3
 
-_MOST = 1.0  # change of a log distance by one step
+_MAX_LOG_STEP = 1.0  # change of a log distance by one step
 
 
 @dataclass(frozen=True)
-class Seen:
+class CameraPoints:
     """m points in C.
 
     Attributes:
@@ -30,14 +30,14 @@ class Seen:
     R_CW: np.ndarray
 
 
-def see(R_WB: np.ndarray, p_WB: np.ndarray, R_BC: np.ndarray, p_BC: np.ndarray, X_W: np.ndarray) -> Seen:
+def transform_to_camera(R_WB: np.ndarray, p_WB: np.ndarray, R_BC: np.ndarray, p_BC: np.ndarray, X_W: np.ndarray) -> CameraPoints:
     """Transform points in W, shape (m, 3), into C, with derivatives, given the poses of the body and of the camera on it."""
     X_B = (X_W - p_WB) @ R_WB
     X_C = (X_B - p_BC) @ R_BC
     by_camera = np.empty((len(X_W), 3, 12))
     by_camera[:, :, :3], by_camera[:, :, 3:6] = R_BC.T @ so3.hat(X_B), -(R_WB @ R_BC).T
     by_camera[:, :, 6:9], by_camera[:, :, 9:] = so3.hat(X_C), -R_BC.T
-    return Seen(X_C, by_camera, (R_WB @ R_BC).T)
+    return CameraPoints(X_C, by_camera, (R_WB @ R_BC).T)
 
 
 def moved(X_C: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -52,11 +52,11 @@ def moved(X_C: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     d2 = (X_C**2).sum(axis=1, keepdims=True)
     along = (X_C * step).sum(axis=1, keepdims=True) / d2
-    S = np.exp(np.clip(along, -_MOST, _MOST))[:, :, None] * so3.exp(np.cross(X_C, step) / d2)
+    S = np.exp(np.clip(along, -_MAX_LOG_STEP, _MAX_LOG_STEP))[:, :, None] * so3.exp(np.cross(X_C, step) / d2)
     return (S @ X_C[:, :, None])[:, :, 0], S
 
 
-def carried(before: Seen, after: Seen, S: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def error_transport(before: CameraPoints, after: CameraPoints, S: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the transform of errors in W that keeps those of m points in C constant, except for S, when camera and points move.
 
         dX_W' = by_camera dc - by_moved dc' + by_point dX_W,

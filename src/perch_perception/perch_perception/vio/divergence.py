@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from perch_perception.ukf.stillness import MOST_ACCEL_BIAS, MOST_GYRO_BIAS
+from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS
 from perch_perception.vio import state as at
 
 SPEED_MAX = 25.0  # faster flies no vehicle that this is for [m/s]
-_REFUSED = 20  # observations that may be refused, however few are used
-_VELOCITY = 1.0  # largest 1 sigma of the velocity [m/s]
+_MIN_REFUSED = 20  # observations that may be refused, however few are used
+_MAX_VELOCITY_SIGMA = 1.0  # largest 1 sigma of the velocity [m/s]
 
 
 def velocity_sigma(state: at.State) -> float:
@@ -27,12 +27,12 @@ def divergence(state: at.State, used: int, refused: int, frames: int) -> str:
     speed, gyro, accel = (float(np.linalg.norm(v)) for v in (state.v_WB, state.gyro_bias, state.accel_bias))
     if not np.isfinite(state.P).all() or not np.isfinite(state.p_WB).all():
         return "state is not finite"
-    if refused > max(used, _REFUSED):
+    if refused > max(used, _MIN_REFUSED):
         return f"{refused} observations refused and {used} used in {frames} frames"
-    if (sigma := velocity_sigma(state)) > _VELOCITY:
+    if (sigma := velocity_sigma(state)) > _MAX_VELOCITY_SIGMA:
         return f"velocity known only to {sigma:.1f} m/s"
     if speed > SPEED_MAX:
         return f"a speed of {speed:.1f} m/s"
-    if gyro > 2.0 * MOST_GYRO_BIAS or accel > 2.0 * MOST_ACCEL_BIAS:
+    if gyro > 2.0 * MAX_GYRO_BIAS or accel > 2.0 * MAX_ACCEL_BIAS:
         return f"biases of {gyro:.2f} rad/s and {accel:.1f} m/s^2: gravity and motion do not fit"
     return ""

@@ -15,13 +15,13 @@ from perch_perception.vio.landmark_choice import Spread
 from perch_perception.vio.msckf import Msckf
 
 SIGMA = 0.005         # of the ground about its plane: a level floor [m]
-_LEAST_HEIGHT = 0.08  # a camera that stands lower sees a blur [m]
-_STEEP = 0.35        # least sine of a ray below the horizon
+_MIN_HEIGHT = 0.08    # a camera that stands lower sees a blur [m]
+_MIN_SINE = 0.35      # least sine of a ray below the horizon
 _CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
-_POSE = np.r_[0:6]   # theta, p
+_POSE = np.r_[0:6]    # theta, p
 
 
-def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float) -> int:
+def add_ground_landmarks(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float) -> int:
     """Add ground points as landmarks to the state of a vehicle that stands on the ground.
 
     A point lies where its ray intersects the plane z = floor. Two rows of its bearing's residual and one of the plane determine
@@ -39,11 +39,11 @@ def take_in(filter: Msckf, ids: np.ndarray, bearings: Bearings, floor: float) ->
     s, limits = filter.state, filter.config.filter
     centre = s.p_WB + s.R_WB @ s.p_BC
     height = float(centre[2] - floor)
-    if height < _LEAST_HEIGHT or not len(ids):
+    if height < _MIN_HEIGHT or not len(ids):
         return 0
     rays = bearings.b_C @ (s.R_WB @ s.R_BC).T
     spread, chosen = Spread({}, limits.landmarks), list[int]()
-    for k in np.flatnonzero(rays[:, 2] < -_STEEP).tolist():
+    for k in np.flatnonzero(rays[:, 2] < -_MIN_SINE).tolist():
         if len(chosen) < limits.landmarks and spread.admits(bearings.b_C[k]):
             spread.add(int(ids[k]), bearings.b_C[k])
             chosen.append(k)

@@ -29,14 +29,14 @@ from perch_perception.vio.config import VioConfig
 from perch_perception.vio.gyro_bias import RayPair, solve_gyro_bias
 from perch_perception.vio.preintegration import Preintegration, preintegrate
 from perch_perception.vio.start import KnownPose
-from perch_perception.vio.start_refinement import Refined, Sight, refine
+from perch_perception.vio.start_refinement import PointObservations, Refined, refine
 from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Tracks
 from perch_perception.vio.triangulation import triangulate
 
 DURATION = 0.5       # of the frames after which a start is tried first [s]
 _TRACK_NOISE = 1.0  # 1 sigma of a track about its point over the frames of a start [px]
-_LEAST_FEATURES = 12
+_MIN_FEATURES = 12
 _LEAST_FRAMES = 6
 _MOST_FRAMES = 16      # of the longest stretch; more cost time and tell little
 _ITERATIONS = 10
@@ -112,10 +112,10 @@ def _refined(G: np.ndarray, e: np.ndarray, rays: np.ndarray, seen: np.ndarray, s
         M = (np.eye(3) - u[..., :, None] * u[..., None, :]) * (used / distance**2)[..., None, None]
         A = M.sum(axis=1)
         eigenvalues = np.linalg.eigvalsh(A)
-        told = eigenvalues[:, 0] > 1e-6 * eigenvalues.sum(axis=1)
-        if told.sum() < _LEAST_FEATURES:
+        determined = eigenvalues[:, 0] > 1e-6 * eigenvalues.sum(axis=1)
+        if determined.sum() < _MIN_FEATURES:
             return None  # too little parallax
-        u, distance, rays, seen, used, M, A = (x[told] for x in (u, distance, rays, seen, used, M, A))
+        u, distance, rays, seen, used, M, A = (x[determined] for x in (u, distance, rays, seen, used, M, A))
         target = e + distance[..., None] * rays  # the point is X = target + G y, but for what M does not see
         MG, Mt = np.einsum("fkij,kjl->fkil", M, G), np.einsum("fkij,fkj->fki", M, target)
         inverse, SG, St = np.linalg.inv(A), MG.sum(axis=1), Mt.sum(axis=1)
@@ -134,7 +134,7 @@ def _refined(G: np.ndarray, e: np.ndarray, rays: np.ndarray, seen: np.ndarray, s
         cosine = (u * rays).sum(axis=2)
         off2 = np.maximum(1.0 - cosine**2, 0.0)
         bad = np.where(seen & (cosine < 0.0), 1.0, np.where(seen, off2, 0.0)).sum(axis=1) / seen.sum(axis=1) > (4.0 * sigma) ** 2
-        used = seen if iteration < 2 or (~bad).sum() < _LEAST_FEATURES else seen & ~bad[:, None]  # not points of the static world
+        used = seen if iteration < 2 or (~bad).sum() < _MIN_FEATURES else seen & ~bad[:, None]  # not points of the static world
     if (used & (cosine < 0.5)).any():
         return None
     rms2 = off2[used].mean()
@@ -222,7 +222,7 @@ class MotionStart:
             if len(sights) >= _LEAST_FRAMES:
                 seen.append(np.array([k for k, _ in sights]))
                 rays.append(np.array([b for _, b in sights]) @ self._mount.R_BC.T)
-        if len(rays) < _LEAST_FEATURES:
+        if len(rays) < _MIN_FEATURES:
             return None
         sigma = _TRACK_NOISE / self._mount.camera.fx
         self._find_gyro_bias(frames, imu, rays, seen, sigma)
@@ -247,18 +247,18 @@ class MotionStart:
         best = min(refined, key=lambda x: x.cost, default=None)
         if best is None or best.misfit > _MISFIT or best.kept < _KEPT or best.scale > _SCALE:
             return None
-        if any(x.cost < best.cost + _RIVAL and x.differs_from(best) for x in refined):
+        if any(x.cost < best.cost + _RIVAL and x.is_distinct_from(best) for x in refined):
             return None
         return self._state(best, known(best.gyro_bias), self._stamps[frames[-1]])
 
     def _refined(self, end: MotionSolution, parts: list[Preintegration], steps: list[np.ndarray], place: dict[int, int]) -> Refined | None:
         R_WB = start.levelled(np.eye(3), -end.g)
         sights = self._sights(R_WB, end, parts, place)
-        if len(sights) < _LEAST_FEATURES:
+        if len(sights) < _MIN_FEATURES:
             return None
         return refine(self._config, self._mount, steps, sights, R_WB, R_WB @ end.v, self.gyro_bias, end.accel_bias, self._known_bias)
 
-    def _sights(self, R_WB: np.ndarray, found: MotionSolution, parts: list[Preintegration], place: dict[int, int]) -> list[Sight]:
+    def _sights(self, R_WB: np.ndarray, found: MotionSolution, parts: list[Preintegration], place: dict[int, int]) -> list[PointObservations]:
         """Return the tracks with parallax, their points triangulated along the motion found."""
         R = np.array([R_WB @ p.dR for p in parts])
         p = np.array([found.v * p.duration + 0.5 * found.g * p.duration**2 + p.dp + p.J[3:6, 3:] @ found.accel_bias for p in parts]) @ R_WB.T
@@ -272,7 +272,7 @@ class MotionStart:
             X = triangulate(centres[js], np.einsum("nij,nj->ni", R[js] @ self._mount.R_BC, b_C), np.radians(_PARALLAX_DEG),
                             2.0 * _TRACK_NOISE / self._mount.camera.fx)
             if X is not None:
-                out.append(Sight(js, Bearings(b_C, np.array([track.shape[k] for k in ks])), X))
+                out.append(PointObservations(js, Bearings(b_C, np.array([track.shape[k] for k in ks])), X))
         return sorted(out, key=lambda sight: -len(sight.frames))[:_MOST_POINTS]
 
     def _find_gyro_bias(self, frames: list[int], imu: ImuBuffer, rays: list[np.ndarray], seen: list[np.ndarray], sigma: float) -> None:
@@ -281,7 +281,7 @@ class MotionStart:
         for i in range(half):
             j = i + half
             both = [(d[k == i][0], d[k == j][0]) for d, k in zip(rays, seen) if i in k and j in k]
-            if len(both) >= _LEAST_FEATURES:
+            if len(both) >= _MIN_FEATURES:
                 part = preintegrate(imu.run(self._stamps[frames[i]], self._stamps[frames[j]]), self.gyro_bias, np.zeros(3))
                 first, second = np.array(both).swapaxes(0, 1)
                 pairs.append(RayPair(part.dR, part.J[:3, :3], first, second))
@@ -294,7 +294,7 @@ class MotionStart:
         turned = R_WB @ so3.hat(v_B)
         if largest_sigma(P[:3, :3]) > _TILT or largest_sigma(P[3:6, 3:6]) > _SPEED:
             return None
-        state = start.fresh(self._config, self._mount, stamp, R_WB, pose, R_WB @ v_B, found.gyro_bias, 0.0, 0.0, 0.0)
+        state = start.initial_state(self._config, self._mount, stamp, R_WB, pose, R_WB @ v_B, found.gyro_bias, 0.0, 0.0, 0.0)
         state.accel_bias, state.R_BC, state.p_BC = found.accel_bias, found.R_BC, found.p_BC
         state.time_offset += found.time_offset
         rows = np.r_[at.THETA, at.VELOCITY, 9:at.CORE_SIZE]

@@ -17,7 +17,7 @@ from perch_perception.vio.bearing import POINT, Bearings, residuals
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.landmark_choice import Spread
 from perch_perception.vio.propagation import propagate
-from perch_perception.vio.sliding import Sliding
+from perch_perception.vio.sliding import TrackWalk
 from perch_perception.vio.state import State
 from perch_perception.vio.tracks import Track, Tracks
 from perch_perception.vio.triangulation import triangulate
@@ -25,8 +25,8 @@ from perch_perception.vio.triangulation import triangulate
 _GATE = 0.99  # chi2 of a track or landmark
 _PARALLAX = 1.0  # of a triangulated point [deg]
 _NEW_LANDMARKS = 5  # per frame, at most
-_MOST_TRACKS = 12  # ended tracks used per frame
-_STRIKES = 3  # refused observations in a row after which a landmark is dropped
+_MAX_TRACKS = 12  # ended tracks used per frame
+_MAX_REFUSALS = 3  # refused observations in a row after which a landmark is dropped
 _CALIBRATION = np.arange(at.INERTIAL_SIZE, at.CORE_SIZE)
 
 
@@ -58,7 +58,7 @@ class Msckf:
         self.config, self.state = config, state
         self.tracks = Tracks()
         self.sigma = config.filter.pixel_noise / focal_length
-        self.sliding = Sliding(config.filter, focal_length)
+        self.track_walk = TrackWalk(config.filter, focal_length)
         self._gate = ekf.Gate(_GATE)
         self._used: set[int] = set()  # features whose information is in the state already
 
@@ -83,8 +83,8 @@ class Msckf:
         self._update_landmarks(report)
         if len(s.clones) >= self.config.filter.clones:
             spanning = self._spanning()
-            self._take_in_landmarks(spanning, report)
-            ended |= self._spend(spanning)
+            self._add_landmarks(spanning, report)
+            ended |= self._pop_unused_spanning(spanning)
         self._update_tracks(ended, report)
         s.drop_clones(list(range(len(s.clones) - self.config.filter.clones + 1)))
         if s.clones:
@@ -130,7 +130,7 @@ class Msckf:
             k = POINT.start + 3 * i
             H[i, :, k : k + 3] = now.J[i, :, POINT]
         H, r = H / noise[:, :, None], now.r / noise
-        self._let_slide(tracks, now.distance)
+        self._add_track_walk(tracks, now.distance)
         P = s.P[np.ix_(columns, columns)]
         HP = (H.reshape(2 * m, -1) @ P).reshape(H.shape)
         S = np.einsum("kia,kja->kij", HP, H) + self.sigma**2 * np.eye(2)
@@ -138,8 +138,8 @@ class Msckf:
         good = (distance < self._gate.limit(2)) & (now.cosine > 0.5)
         bad = set()
         for ok, (i, landmark) in zip(good, s.landmarks.items()):
-            landmark.strikes = 0 if ok else landmark.strikes + 1
-            if landmark.strikes >= _STRIKES:
+            landmark.consecutive_refusals = 0 if ok else landmark.consecutive_refusals + 1
+            if landmark.consecutive_refusals >= _MAX_REFUSALS:
                 bad.add(i)
         report.landmarks_used, report.refused = int(good.sum()), report.refused + int((~good).sum())
         if good.any():
@@ -155,16 +155,16 @@ class Msckf:
             i: t for i, t in self.tracks.by_id.items() if i not in s.landmarks and i not in self._used
             and t.frames[0] == oldest and len(t.frames) >= limits.clones - 1})
 
-    def _spend(self, spanning: dict[int, Track]) -> dict[int, Track]:
+    def _pop_unused_spanning(self, spanning: dict[int, Track]) -> dict[int, Track]:
         """Remove and return spanning tracks that did not become landmarks, to be used as if ended; their features restart."""
-        spent: dict[int, Track] = {}
+        removed: dict[int, Track] = {}
         for i in spanning:
-            if i not in self.state.landmarks and len(spent) < _MOST_TRACKS:
-                spent[i] = self.tracks.by_id[i]
+            if i not in self.state.landmarks and len(removed) < _MAX_TRACKS:
+                removed[i] = self.tracks.by_id[i]
                 self.tracks.by_id[i] = Track()
-        return spent
+        return removed
 
-    def _take_in_landmarks(self, spanning: dict[int, Track], report: FrameReport) -> None:
+    def _add_landmarks(self, spanning: dict[int, Track], report: FrameReport) -> None:
         """Make spanning tracks landmarks where the view has room for them."""
         s, limits = self.state, self.config.filter
         if limits.landmarks == 0:
@@ -205,7 +205,7 @@ class Msckf:
         """Update with tracks that have just ended, longest first; their points are eliminated."""
         s = self.state
         useful = [t for i, t in ended.items() if i not in self._used and i not in s.landmarks and len(t.frames) >= 4]
-        useful = sorted(useful, key=lambda t: -len(t.frames))[:_MOST_TRACKS]
+        useful = sorted(useful, key=lambda t: -len(t.frames))[:_MAX_TRACKS]
         if not useful:
             return
         columns, rows, rests = self._window_columns(), [], []
@@ -257,7 +257,7 @@ class Msckf:
         for number, _, ks in chosen:
             rows = slice(begin, begin + len(ks))
             begin = rows.stop
-            X_W = triangulate(centres[rows], rays[rows], least, self.sliding.spread(bearings.b_C[rows], noise[rows]))
+            X_W = triangulate(centres[rows], rays[rows], least, self.track_walk.spread(bearings.b_C[rows], noise[rows]))
             if X_W is None:
                 report.refused += int(rays[rows.start] @ rays[rows.stop - 1] < np.cos(least))
             else:
@@ -266,7 +266,7 @@ class Msckf:
         if not parts:
             return out
         now = self._residuals(R[js], p[js], X, bearings)
-        walk = self.sliding.steps(bearings.b_C[:-1], bearings.b_C[1:], now.distance[:-1], now.distance[1:])
+        walk = self.track_walk.steps(bearings.b_C[:-1], bearings.b_C[1:], now.distance[:-1], now.distance[1:])
         n = len(_CALIBRATION)
         for number, X_W, rows in parts:
             m = rows.stop - rows.start
@@ -274,7 +274,7 @@ class Msckf:
             A[:, :, :n] = now.J[rows, :, :n]
             A[:, :, n:-4].reshape(m, 2, -1, 6)[np.arange(m), :, js[rows]] = now.J[rows, :, n : POINT.start]
             A[:, :, -4:-1], A[:, :, -1] = now.J[rows, :, POINT], now.r[rows]
-            white = self.sliding.whitened(walk[rows.start : rows.stop - 1], A.reshape(m, -1), noise[rows]).reshape(2 * m, -1)
+            white = self.track_walk.whitened(walk[rows.start : rows.stop - 1], A.reshape(m, -1), noise[rows]).reshape(2 * m, -1)
             out[number] = X_W, white[:, :-4], white[:, -4:-1], white[:, -1]
         return out
 
@@ -296,7 +296,7 @@ class Msckf:
         ids = list(tracks)
         return {ids[k]: tracks[ids[k]] for k in order if ends[k] < enough}
 
-    def _let_slide(self, tracks: list[Track], distance: np.ndarray) -> None:
+    def _add_track_walk(self, tracks: list[Track], distance: np.ndarray) -> None:
         """Add the walk of all landmarks since the last frame (`sliding`) to P; `distance`: from the camera [m], shape (n,)."""
         s = self.state
         if len(s.clones) < 2:
@@ -305,7 +305,7 @@ class Msckf:
         last = np.linalg.norm(np.array([k.X_W for k in landmarks]) - before.p_WB - before.R_WB @ s.p_BC, axis=1)
         b_last, b_now = (np.array([t.b_C[max(k, -len(t.b_C))] for t in tracks]) for k in (-2, -1))
         rows = s.landmark_start + np.arange(3 * len(tracks)).reshape(-1, 3)
-        s.P[rows[:, :, None], rows[:, None, :]] += self.sliding.of_points(b_last, b_now, last, distance, s.clones[-1].R_WB @ s.R_BC)
+        s.P[rows[:, :, None], rows[:, None, :]] += self.track_walk.of_points(b_last, b_now, last, distance, s.clones[-1].R_WB @ s.R_BC)
 
     def _residuals(self, R_WB: np.ndarray, p_WB: np.ndarray, X_W: np.ndarray, bearings: Bearings):
         s, n = self.state, len(X_W)

@@ -15,7 +15,7 @@ from perch_core.camera import Camera
 from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
-from perch_perception.ukf.stillness import energy, still, window
+from perch_perception.ukf.stillness import energy, is_at_rest, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
@@ -24,19 +24,19 @@ from perch_perception.vio.config import VioConfig
 from perch_perception.vio.divergence import SPEED_MAX, divergence, velocity_sigma
 from perch_perception.vio.msckf import FrameReport, Msckf
 from perch_perception.vio.preintegration import preintegrate
-from perch_perception.vio.recent_views import LEAST_TRACKS, STANDS, RecentViews
+from perch_perception.vio.recent_views import MIN_TRACKS, STATIC_DURATION, RecentViews
 from perch_perception.vio.result import FrameOutcome, VioPoseEstimate, VioResult
 from perch_perception.vio.start import KnownPose
 from perch_perception.vio.tracker import Features, Tracker
 from perch_perception.vio.triangulation import triangulate
 
-_REST_LAG = 0.25  # the filter stays this far behind while it stands still [s]
-_DARK = 0.15  # time without a visual update that is blindness where nothing is tracked [s]
-_BLIND = 0.5  # the same whatever is tracked [s]
-_LEAVING = 1.0  # from rest on, in which a take-off may go on blind [s]
-_LEAVING_VELOCITY = 0.05  # 1 sigma up to which it may [m/s]
-_FATES = 15  # frames over which observations that are refused and used are counted
-_FUTURE = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
+_REST_DELAY = 0.25  # the filter stays this far behind while it stands still [s]
+_MAX_BLIND_NO_TRACKS = 0.15  # longest time without a visual update where nothing is tracked [s]
+_MAX_BLIND = 0.5  # the same while features are tracked [s]
+_MAX_BLIND_TAKE_OFF = 1.0  # the same at a take-off, from rest on [s]
+_MAX_TAKE_OFF_SIGMA = 0.05  # largest 1 sigma of the velocity in a blind take-off [m/s]
+_DIVERGENCE_FRAMES = 15  # frames over which observations that are refused and used are counted
+_MAX_STAMP_LEAD = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
 _INERTIAL = np.r_[at.POSITION, at.VELOCITY, at.THETA, at.GYRO_BIAS, at.ACCEL_BIAS]  # the order of an estimate's covariance
 
 
@@ -60,46 +60,46 @@ class VisualInertialOdometry:
         self.filter: Msckf | None = None
         self.restarts = 0
         self._imu = ImuBuffer(config.imu, 2.0 + motion_start.DURATION)
-        self._known = start.told(p_WB, yaw)
+        self._known_pose = start.configured_pose(p_WB, yaw)
         self._floor = floor
-        self._views: deque[tuple[int, Features]] = deque()  # (exposed, features) of frames at rest that the filter has not passed
-        self._seen = RecentViews()
+        self._views: deque[tuple[int, Features]] = deque()  # (exposure, features) at rest, not passed by the filter
+        self._recent_views = RecentViews()
         self._biases: tuple[np.ndarray, np.ndarray] | None = None  # of gyro and accelerometer (6,) and their variances, of the last filter
-        self._lost: tuple[int, float] | None = None  # when the last filter ended, and how fast it was [ns, m/s]
-        self._resting = False
-        self._told = True     # it stands where it was told to start
-        self._sight: int | None = None  # when vision last changed the state; None: not since the last rest
+        self._lost_at: tuple[int, float] | None = None  # when the last filter ended, and how fast it was [ns, m/s]
+        self._at_rest = False
+        self._at_configured_start = True  # the vehicle has not left the configured start
+        self._last_visual_update: int | None = None  # when vision last changed the state; None: not since the last rest
         self._frame = 0
-        self._last_image = -1           # stamp of the last frame used, on the board's clock
-        self._last_exposed: int | None = None
-        self._informed = 0              # when vision or rest last updated the filter
-        self._fates: deque[tuple[int, int]] = deque(maxlen=_FATES)  # observations used and refused
-        self._look_through(mount)
+        self._last_image = -1  # stamp of the last frame used, on the board's clock
+        self._last_exposure: int | None = None
+        self._last_update = 0  # when vision or rest last updated the filter
+        self._observation_counts: deque[tuple[int, int]] = deque(maxlen=_DIVERGENCE_FRAMES)  # observations used and refused
+        self._set_camera(mount)
 
-    def _look_through(self, mount: CameraMount) -> None:
+    def _set_camera(self, mount: CameraMount) -> None:
         self.mount = mount
         self.tracker = Tracker(self.config.tracker, mount.camera)
-        self._seen.clear()
-        self._await()
+        self._recent_views.clear()
+        self._begin_motion_start()
         _compile(mount.camera)
 
     def use_camera(self, mount: CameraMount) -> None:
         """Switch to another camera or calibration: a filter in flight is dropped and restarted in motion."""
-        if self._resting:
-            self._know()
-            self.filter, self._resting = None, False  # nothing is lost: it still stands there
+        if self._at_rest:
+            self._store_pose()
+            self.filter, self._at_rest = None, False  # nothing is lost: it still stands there
         elif self.filter is not None:
-            self._forget_state()
+            self._drop_filter()
         else:
-            self._known = self._known_with(self._turned_bias)
+            self._known_pose = self._known_pose_with_bias(self._rotation_bias)
         self._views.clear()
-        self._look_through(mount)
+        self._set_camera(mount)
 
-    def _await(self) -> None:
+    def _begin_motion_start(self) -> None:
         """Begin to collect frames for a start in motion."""
-        self._moving = motion_start.MotionStart(self.config, self.mount, None if self._biases is None else self._biases[0][:3])
+        self._motion_start = motion_start.MotionStart(self.config, self.mount, None if self._biases is None else self._biases[0][:3])
         # rotation since the pose was known, by the gyro less a bias, and its derivative by that
-        self._turned, self._turned_bias = (np.eye(3), np.zeros((3, 3))), self._moving.gyro_bias
+        self._rotation, self._rotation_bias = (np.eye(3), np.zeros((3, 3))), self._motion_start.gyro_bias
 
     @property
     def gyro_sigma(self) -> float:
@@ -114,8 +114,8 @@ class VisualInertialOdometry:
     def covers(self, stamp: int) -> bool:
         """Whether the IMU has passed the exposure of an image with this stamp [ns], or the stamp is too far ahead to wait for."""
         newest = self._imu.last.stamp if self._imu.last else None
-        exposed = stamp + round(self.time_offset * 1e9)
-        return newest is not None and (exposed <= newest or exposed > newest + _FUTURE)
+        exposure = stamp + round(self.time_offset * 1e9)
+        return newest is not None and (exposure <= newest or exposure > newest + _MAX_STAMP_LEAD)
 
     @property
     def _running(self) -> Msckf:
@@ -134,211 +134,213 @@ class VisualInertialOdometry:
             stamp: of the image, on the camera's clock [ns].
             image: grey, uint8 (height, width).
         """
-        exposed = stamp + round(self.time_offset * 1e9)
-        problem = self._problem(stamp, exposed, image)
+        exposure = stamp + round(self.time_offset * 1e9)
+        problem = self._problem(stamp, exposure, image)
         if problem is not None:
             return VioResult(problem, restarts=self.restarts, message=f"frame {stamp} ns {problem.value}")
         self._last_image = stamp
-        if self._last_exposed is not None and self._last_exposed < self._imu.oldest:
+        if self._last_exposure is not None and self._last_exposure < self._imu.oldest:
             self._resume()
-        features = self._track(image, exposed)
+        features = self._track(image, exposure)
         self._frame += 1
         if self.filter is None:
-            result = self._try_start(exposed, features)
+            result = self._try_start(exposure, features)
         else:
-            result = self._step(exposed, features)
-        self._last_exposed = exposed
+            result = self._step(exposure, features)
+        self._last_exposure = exposure
         return result
 
-    def _problem(self, stamp: int, exposed: int, image: np.ndarray) -> FrameOutcome | None:
+    def _problem(self, stamp: int, exposure: int, image: np.ndarray) -> FrameOutcome | None:
         camera = self.mount.camera
         if image.dtype != np.uint8 or image.shape != (camera.height, camera.width):
             return FrameOutcome.BAD_IMAGE
         if self._imu.last is None:
             return FrameOutcome.NO_IMU
-        if stamp <= self._last_image or (self.filter and exposed <= self.filter.state.stamp):
+        if stamp <= self._last_image or (self.filter and exposure <= self.filter.state.stamp):
             return FrameOutcome.NOT_NEWER
-        if exposed > self._imu.last.stamp:
+        if exposure > self._imu.last.stamp:
             return FrameOutcome.FUTURE
-        return FrameOutcome.TOO_OLD if exposed < self._imu.oldest else None
+        return FrameOutcome.TOO_OLD if exposure < self._imu.oldest else None
 
     def _resume(self) -> None:
         """Restart from the last known pose after a gap in the images that is longer than the IMU history.
 
         A vehicle at rest is assumed to rest there still. One in motion may have turned by any angle.
         """
-        moved = self._lost is not None or (self.filter is not None and not self._resting)
+        moved = self._lost_at is not None or (self.filter is not None and not self._at_rest)
         if self.filter is not None:
-            self._forget_state()
+            self._drop_filter()
         if moved:
-            covariance = self._known.covariance.copy()
+            covariance = self._known_pose.covariance.copy()
             covariance[3, :3] = covariance[:3, 3] = 0.0
             covariance[3, 3] = np.pi**2 / 3.0  # all headings alike
-            self._known = replace(self._known, covariance=covariance)
+            self._known_pose = replace(self._known_pose, covariance=covariance)
         self.tracker.reset()
-        self._seen.clear()
+        self._recent_views.clear()
         self._views.clear()
-        self._last_exposed = None
+        self._last_exposure = None
 
-    def _track(self, image: np.ndarray, exposed: int) -> Features:
+    def _track(self, image: np.ndarray, exposure: int) -> Features:
         state = self.filter.state if self.filter else None
         R_BC = state.R_BC if state else self.mount.R_BC
         turn, slack = np.eye(3), 0.0
-        if self._last_exposed is not None:
-            steps = self._imu.run(self._last_exposed, exposed)
-            turn = preintegrate(steps, state.gyro_bias if state else self._moving.gyro_bias, np.zeros(3)).dR
+        if self._last_exposure is not None:
+            steps = self._imu.run(self._last_exposure, exposure)
+            turn = preintegrate(steps, state.gyro_bias if state else self._motion_start.gyro_bias, np.zeros(3)).dR
             if state is None:
-                part = preintegrate(steps, self._turned_bias, np.zeros(3))
-                self._turned = self._turned[0] @ part.dR, part.dR.T @ self._turned[1] + part.J[:3, :3]
-                slack = 2e-9 * self._moving.gyro_sigma * (exposed - self._last_exposed)
+                part = preintegrate(steps, self._rotation_bias, np.zeros(3))
+                self._rotation = self._rotation[0] @ part.dR, part.dR.T @ self._rotation[1] + part.J[:3, :3]
+                slack = 2e-9 * self._motion_start.gyro_sigma * (exposure - self._last_exposure)
         features = self.tracker.track(image, R_BC.T @ turn.T @ R_BC, slack)
-        self._seen.add(exposed, features)
+        self._recent_views.add(exposure, features)
         return features
 
     # -- before the start --------------------------------------------------------------------------------------------
 
-    def _try_start(self, exposed: int, features: Features) -> VioResult:
+    def _try_start(self, exposure: int, features: Features) -> VioResult:
         """Start at rest or, when the vehicle moves, from the frames of the last half second or more."""
-        steps = window(self._imu, exposed)
+        steps = window(self._imu, exposure)
         biases, variance = self._biases or (None, None)
-        if self._seen.still() is not False and still(steps, biases, variance, bool(self._seen.still(STANDS))):
-            self._begin(start.at_rest(self.config, self.mount, exposed, steps, self._known_with(steps[:, GYRO].mean(axis=0))))
-            return self._hold(exposed, features)
-        self._moving.add(self._frame, exposed, features.ids, observe(self.mount.camera, features.pixels))
-        state = self._moving.solve(self._imu, self._known_with)
+        if self._recent_views.is_static() is not False and is_at_rest(steps, biases, variance, bool(self._recent_views.is_static(STATIC_DURATION))):
+            self._begin(start.at_rest(self.config, self.mount, exposure, steps,
+                                      self._known_pose_with_bias(steps[:, GYRO].mean(axis=0))))
+            return self._hold(exposure, features)
+        self._motion_start.add(self._frame, exposure, features.ids, observe(self.mount.camera, features.pixels))
+        state = self._motion_start.solve(self._imu, self._known_pose_with_bias)
         if state is not None:
             self._begin(state)
-            self._told, self._sight = False, exposed
+            self._at_configured_start, self._last_visual_update = False, exposure
             return self._result(FrameOutcome.TRACKING, features, FrameReport())
         outcome = FrameOutcome.LOST if self.restarts else FrameOutcome.INITIALISING
         return VioResult(outcome, None, len(features.ids), restarts=self.restarts, message=outcome.value)
 
-    def _known_with(self, gyro_bias: np.ndarray) -> KnownPose:
+    def _known_pose_with_bias(self, gyro_bias: np.ndarray) -> KnownPose:
         """Return the known present pose, with the heading propagated by the gyro less this bias."""
-        dR, J = self._turned
-        return replace(self._known, R_WB=self._known.R_WB @ dR @ so3.exp(J @ (gyro_bias - self._turned_bias)))
+        dR, J = self._rotation
+        return replace(self._known_pose, R_WB=self._known_pose.R_WB @ dR @ so3.exp(J @ (gyro_bias - self._rotation_bias)))
 
     def _begin(self, state: at.State) -> None:
-        if self._lost is not None:
-            since, speed = self._lost
+        if self._lost_at is not None:
+            since, speed = self._lost_at
             if since >= self._imu.oldest:
-                start.carry(state, preintegrate(self._imu.run(since, state.stamp), state.gyro_bias, state.accel_bias))
-            else:  # it has moved since by nobody knows what
+                start.propagate_position(state, preintegrate(self._imu.run(since, state.stamp), state.gyro_bias, state.accel_bias))
+            else:  # its motion since then is unknown
                 reach = 1e-9 * (state.stamp - since) * max(speed, float(np.linalg.norm(state.v_WB)))
                 state.P[at.POSITION, at.POSITION] += reach**2 * np.eye(3)
-            self._lost = None
+            self._lost_at = None
         self.filter = Msckf(self.config, state, self.mount.camera.fx)
-        self._informed = state.stamp
-        self._fates.clear()
+        self._last_update = state.stamp
+        self._observation_counts.clear()
 
     # -- afterwards --------------------------------------------------------------------------------------------------
 
-    def _step(self, exposed: int, features: Features) -> VioResult:
-        if self._is_still(exposed):
-            return self._hold(exposed, features)
+    def _step(self, exposure: int, features: Features) -> VioResult:
+        if self._is_at_rest(exposure):
+            return self._hold(exposure, features)
         filter = self._running
-        if self._resting and self._told and self._floor is not None and not filter.state.landmarks:
-            self._stand_on(self._floor, features)
-        self._resting = False
-        filter.propagate(self._imu.run(filter.state.stamp, exposed), exposed)
+        if self._at_rest and self._at_configured_start and self._floor is not None and not filter.state.landmarks:
+            self._add_ground_landmarks(self._floor, features)
+        self._at_rest = False
+        filter.propagate(self._imu.run(filter.state.stamp, exposure), exposure)
         report = filter.add_frame(self._frame, features.ids, self._observe(features))
         if report.used:
-            self._sight, self._told = exposed, False
-        return self._judge(exposed, features, report)
+            self._last_visual_update, self._at_configured_start = exposure, False
+        return self._check_divergence(exposure, features, report)
 
-    def _is_still(self, exposed: int) -> bool:
+    def _is_at_rest(self, exposure: int) -> bool:
         """Whether the vehicle rests: the IMU is quiet, nothing moves in the image, and the filter's velocity may be zero.
 
-        False until `_DARK` after a visual update: a very quiet hover looks like rest.
+        False until `_MAX_BLIND_NO_TRACKS` after a visual update: a very quiet hover looks like rest.
         """
         state = self._running.state
-        if self._sight is not None and exposed - self._sight < round(1e9 * _DARK):
+        if self._last_visual_update is not None and exposure - self._last_visual_update < round(1e9 * _MAX_BLIND_NO_TRACKS):
             return False
-        quiet = self._seen.still()
-        return (quiet is not False and (self._resting or rest.can_stand(state))
-                and still(window(self._imu, exposed), *_biases(state),
-                          seen=bool(quiet) and (self._resting or bool(self._seen.still(STANDS)))))
+        quiet = self._recent_views.is_static()
+        return (quiet is not False and (self._at_rest or rest.velocity_may_be_zero(state))
+                and is_at_rest(window(self._imu, exposure), *_biases(state),
+                               image_is_static=bool(quiet) and (self._at_rest or bool(self._recent_views.is_static(STATIC_DURATION)))))
 
-    def _hold(self, exposed: int, features: Features) -> VioResult:
-        """Update the filter with rest, up to `_REST_LAG` before the exposure.
+    def _hold(self, exposure: int, features: Features) -> VioResult:
+        """Update the filter with rest, up to `_REST_DELAY` before the exposure.
 
         A take-off is detected some time after its beginning. Due to the lag, the rest applied so far remains true, and the filter
         catches up with the IMU when the vehicle leaves. The result at the exposure is its state propagated by the IMU since.
         """
         filter, state = self._running, self._running.state
-        until = max(state.stamp, exposed - round(_REST_LAG * 1e9))
-        if not self._resting:
+        until = max(state.stamp, exposure - round(_REST_DELAY * 1e9))
+        if not self._at_rest:
             filter.propagate(self._imu.run(state.stamp, until), until)
             rest.stop(filter)
-            self._resting, self._sight = True, None
+            self._at_rest, self._last_visual_update = True, None
             self._views.clear()
-        steps, shaken = self._imu.run(state.stamp, until), max(1.0, energy(window(self._imu, exposed)))
+        steps, noise_factor = self._imu.run(state.stamp, until), max(1.0, energy(window(self._imu, exposure)))
         if len(steps):
-            rest.hold(filter, steps, until, shaken)
-        self._informed = exposed
-        self._views.append((exposed, features))
+            rest.hold(filter, steps, until, noise_factor)
+        self._last_update = exposure
+        self._views.append((exposure, features))
         while len(self._views) > 1 and self._views[1][0] <= state.stamp:
             self._views.popleft()
-        return self._result(FrameOutcome.RESTING, features, FrameReport(), rest.moved_on(filter, self._imu.run(until, exposed), exposed, shaken))
+        return self._result(FrameOutcome.RESTING, features, FrameReport(),
+                            rest.propagated_to(filter, self._imu.run(until, exposure), exposure, noise_factor))
 
-    def _stand_on(self, floor: float, features: Features) -> None:
+    def _add_ground_landmarks(self, floor: float, features: Features) -> None:
         """Make ground features that were seen at rest, and still are, the first landmarks."""
-        exposed, view = self._views[0]
-        if exposed > self._running.state.stamp:
+        exposure, view = self._views[0]
+        if exposure > self._running.state.stamp:
             return
         known = np.isin(view.ids, features.ids)
         known[len(view.ids) - view.new:] = False
-        ground.take_in(self._running, view.ids[known], self._observe(view).chosen(known), floor)
+        ground.add_ground_landmarks(self._running, view.ids[known], self._observe(view).chosen(known), floor)
 
     def _observe(self, features: Features) -> Bearings:
         """Return bearings; 1 sigma of each is the larger of the configured `pixel_noise` and the patch fit's by image noise."""
         return replace(observe(self.mount.camera, features.pixels),
                        noise=np.maximum(features.sigma / self.config.filter.pixel_noise, 1.0))
 
-    def _judge(self, exposed: int, features: Features, report: FrameReport) -> VioResult:
+    def _check_divergence(self, exposure: int, features: Features, report: FrameReport) -> VioResult:
         """Return the frame's result, after a check for divergence and for missing visual updates."""
         s = self._running.state
         if report.used:
-            self._informed = exposed
-        self._fates.append((report.used, report.refused))
-        used, refused = np.sum(self._fates, axis=0)
-        why = divergence(s, used, refused, len(self._fates))
+            self._last_update = exposure
+        self._observation_counts.append((report.used, report.refused))
+        used, refused = np.sum(self._observation_counts, axis=0)
+        why = divergence(s, used, refused, len(self._observation_counts))
         if why:
             return self._lose(features, why)
-        blind = (exposed - self._informed) * 1e-9
+        blind = (exposure - self._last_update) * 1e-9
         outcome = FrameOutcome.TRACKING
-        if blind > (_BLIND if len(features.ids) - features.new >= LEAST_TRACKS else _DARK):
+        if blind > (_MAX_BLIND if len(features.ids) - features.new >= MIN_TRACKS else _MAX_BLIND_NO_TRACKS):
             # in the first decimetres the floor is a blur; the standstill's knowledge carries the vehicle over them
-            leaving = self._sight is None and blind < _LEAVING and velocity_sigma(s) < _LEAVING_VELOCITY
+            leaving = self._last_visual_update is None and blind < _MAX_BLIND_TAKE_OFF and velocity_sigma(s) < _MAX_TAKE_OFF_SIGMA
             outcome = FrameOutcome.LEAVING if leaving else FrameOutcome.BLIND
         return self._result(outcome, features, report)
 
     def _lose(self, features: Features, why: str) -> VioResult:
         """Store the known position and heading, and restart in motion."""
-        self._forget_state()
+        self._drop_filter()
         return VioResult(FrameOutcome.LOST, None, len(features.ids), restarts=self.restarts, message=f"lost: {why}")
 
-    def _forget_state(self) -> None:
-        self._know()
+    def _drop_filter(self) -> None:
+        self._store_pose()
         s = self._running.state
         speed = float(np.linalg.norm(s.v_WB))
-        self._lost = s.stamp, speed if speed < SPEED_MAX else SPEED_MAX
-        self._await()
-        self.filter, self._resting, self._told, self.restarts = None, False, False, self.restarts + 1
+        self._lost_at = s.stamp, speed if speed < SPEED_MAX else SPEED_MAX
+        self._begin_motion_start()
+        self.filter, self._at_rest, self._at_configured_start, self.restarts = None, False, False, self.restarts + 1
 
-    def _know(self) -> None:
+    def _store_pose(self) -> None:
         """Store the pose and biases for a new start, unless they are not finite."""
         s = self._running.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
             rows = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
-            self._known = KnownPose(s.p_WB.copy(), s.R_WB.copy(), _estimate(s).pose_covariance[rows])
+            self._known_pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), _estimate(s).pose_covariance[rows])
             self._biases = _biases(s)
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport, now: at.State | None = None) -> VioResult:
         """Return a frame's result; `now`: the state at its exposure; None: the filter's state."""
         s = self._running.state if now is None else now
         return VioResult(outcome, _estimate(s) if outcome.has_pose else None, len(features.ids), report.used, report.refused,
-                         report.nis, report.nis_dimension, (s.stamp - self._informed) * 1e-9, self.restarts, outcome.value)
+                         report.nis, report.nis_dimension, (s.stamp - self._last_update) * 1e-9, self.restarts, outcome.value)
 
 
 def _estimate(s: at.State) -> VioPoseEstimate:

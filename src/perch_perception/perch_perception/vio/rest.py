@@ -19,14 +19,14 @@ from perch_perception.vio import state as at
 from perch_perception.vio.msckf import Msckf
 from perch_perception.vio.propagation import propagate
 
-_STANDS = float(chi2_quantile(1.0 - 1e-6, 3))
+_VELOCITY_GATE = float(chi2_quantile(1.0 - 1e-6, 3))
 _BIASES = np.r_[9:15]
 
 
-def can_stand(state: at.State) -> bool:
+def velocity_may_be_zero(state: at.State) -> bool:
     """Whether the filter's velocity is consistent with zero (chi2): to the IMU, slow, steady flight is as quiet as rest."""
     v = state.v_WB
-    return bool(v @ np.linalg.solve(state.P[at.VELOCITY, at.VELOCITY], v) < _STANDS)
+    return bool(v @ np.linalg.solve(state.P[at.VELOCITY, at.VELOCITY], v) < _VELOCITY_GATE)
 
 
 def stop(filter: Msckf) -> None:
@@ -39,10 +39,10 @@ def stop(filter: Msckf) -> None:
     filter.apply(np.r_[at.VELOCITY], np.eye(3), -s.v_WB, REST_VELOCITY**2)
 
 
-def hold(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> None:
+def hold(filter: Msckf, steps: np.ndarray, stamp: int, noise_factor: float) -> None:
     """Update for a vehicle at rest over IMU steps (m, 9), m > 0, up to their end `stamp` [ns].
 
-    w_mean = b_g + n_w,   f_mean = b_a + R^T g + n_f;  the variance of n is `shaken` times that of the sensor's noise.
+    w_mean = b_g + n_w,   f_mean = b_a + R^T g + n_f;  the variance of n is `noise_factor` times that of the sensor's noise.
     """
     s, imu = filter.state, filter.config.imu
     T = float(steps[:, DT].sum())
@@ -55,21 +55,21 @@ def hold(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> None:
     H[:3, at.GYRO_BIAS] = H[3:, at.ACCEL_BIAS] = np.eye(3)
     H[3:, at.THETA] = so3.hat(up_B)
     residual = np.concatenate([steps[:, GYRO].mean(axis=0) - s.gyro_bias, steps[:, ACCEL].mean(axis=0) - s.accel_bias - up_B])
-    variance = np.repeat([imu.gyro_noise_density**2, imu.accel_noise_density**2], 3) * shaken / T
+    variance = np.repeat([imu.gyro_noise_density**2, imu.accel_noise_density**2], 3) * noise_factor / T
     filter.apply(np.arange(at.INERTIAL_SIZE), H, residual, variance)
     s.stamp = stamp
 
 
-def moved_on(filter: Msckf, steps: np.ndarray, stamp: int, shaken: float) -> at.State:
+def propagated_to(filter: Msckf, steps: np.ndarray, stamp: int, noise_factor: float) -> at.State:
     """Return the inertial state propagated to a later stamp [ns] by IMU steps (m, 9) since the filter's; `filter` is unchanged.
 
     These steps contain the beginning of a take-off before it is detected: at its detection, a velocity of zero would be wrong by
-    10 cm/s. `shaken` as in `hold`.
+    10 cm/s. `noise_factor` as in `hold`.
     """
     n = at.INERTIAL_SIZE
     state = replace(filter.state, stamp=stamp, P=filter.state.P[:n, :n].copy(), clones=[], landmarks={})
     if len(steps):
         rows = steps.copy()
-        rows[:, [GYRO_VARIANCE, ACCEL_VARIANCE]] *= shaken
+        rows[:, [GYRO_VARIANCE, ACCEL_VARIANCE]] *= noise_factor
         propagate(state, rows, filter.config.imu)
     return state

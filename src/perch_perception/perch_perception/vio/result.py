@@ -15,9 +15,9 @@ class FrameOutcome(enum.Enum):
 
     INITIALISING = "waiting for a start at rest or in motion"
     RESTING = "standing still"
-    LEAVING = "leaving the ground: nothing to see yet, the IMU alone is good enough"
+    LEAVING = "take-off: IMU only until the first visual update"
     TRACKING = "tracked"
-    BLIND = "integrating the IMU alone: nothing usable in the image"
+    BLIND = "IMU only: too few usable features in the image"
     LOST = "lost: starting again in motion"
     NOT_NEWER = "refused: stamp is not newer than the frame before"
     FUTURE = "refused: stamp lies ahead of the IMU"

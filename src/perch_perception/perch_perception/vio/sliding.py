@@ -18,7 +18,7 @@ from scipy.linalg import lapack
 from perch_perception.vio.config import FilterConfig
 
 
-class Sliding:
+class TrackWalk:
     """Random walk of tracked points, for a focal length in pixels."""
 
     def __init__(self, config: FilterConfig, focal_length: float) -> None:

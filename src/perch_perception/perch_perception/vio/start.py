@@ -19,7 +19,7 @@ from perch_perception.vio.state import State
 
 
 # 1 sigma of (p, heading) as given: they define W, so hardly any; not none, which would make the covariance singular [m, rad]
-TOLD_SIGMA = (0.001, 0.001, 0.001, 0.001)
+CONFIGURED_POSE_SIGMA = (0.001, 0.001, 0.001, 0.001)
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class KnownPose:
     covariance: np.ndarray
 
 
-def told(p_WB: np.ndarray, yaw: float) -> KnownPose:
+def configured_pose(p_WB: np.ndarray, yaw: float) -> KnownPose:
     """Return the pose at the start from a configured position [m], shape (3,), and yaw [rad]."""
-    return KnownPose(np.array(p_WB, float), so3.exp(np.array([0.0, 0.0, yaw])), np.diag(np.square(TOLD_SIGMA)))
+    return KnownPose(np.array(p_WB, float), so3.exp(np.array([0.0, 0.0, yaw])), np.diag(np.square(CONFIGURED_POSE_SIGMA)))
 
 
 def levelled(R_WB: np.ndarray, up_B: np.ndarray) -> np.ndarray:
@@ -52,7 +52,7 @@ def levelled(R_WB: np.ndarray, up_B: np.ndarray) -> np.ndarray:
     return so3.exp(axis * (np.arctan2(sine, up_W[2]) / sine)) @ R_WB
 
 
-def fresh(config: VioConfig, mount: CameraMount, stamp: int, R_WB: np.ndarray, pose: KnownPose, v_WB: np.ndarray,
+def initial_state(config: VioConfig, mount: CameraMount, stamp: int, R_WB: np.ndarray, pose: KnownPose, v_WB: np.ndarray,
           gyro_bias: np.ndarray, tilt_sigma: float, velocity_sigma: float, gyro_sigma: float) -> State:
     """Return a state without clones; attitude uncertainty is `tilt_sigma` about the horizontal axes and the pose's about z."""
     c = config.calibration
@@ -80,21 +80,21 @@ def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray
     gyro, accel = steps[:, GYRO].mean(axis=0), steps[:, ACCEL].mean(axis=0)
     R_WB = levelled(pose.R_WB, accel)
     imu, T = config.imu, steps[:, DT].sum()
-    shaken = max(1.0, energy(steps))
-    gyro_sigma = imu.gyro_noise_density * np.sqrt(shaken / T)
-    state = fresh(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.2, REST_VELOCITY, gyro_sigma)
+    noise_factor = max(1.0, energy(steps))
+    gyro_sigma = imu.gyro_noise_density * np.sqrt(noise_factor / T)
+    state = initial_state(config, mount, stamp, R_WB, pose, np.zeros(3), gyro, 0.2, REST_VELOCITY, gyro_sigma)
     # a bias that shows along g is, as far as anybody knows, no smaller across it
     accel_sigma = max(imu.accel_bias_init, abs(float(np.linalg.norm(accel)) - GRAVITY))
     state.P[at.ACCEL_BIAS, at.ACCEL_BIAS] = accel_sigma**2 * np.eye(3)
     up_B = R_WB.T @ np.array([0.0, 0.0, GRAVITY])
     H = np.zeros((3, at.INERTIAL_SIZE))
     H[:, at.THETA], H[:, at.ACCEL_BIAS] = so3.hat(up_B), np.eye(3)
-    dx, state.P, _ = ekf.update(state.P, np.arange(at.INERTIAL_SIZE), H, accel - up_B, imu.accel_noise_density**2 * shaken / T)
+    dx, state.P, _ = ekf.update(state.P, np.arange(at.INERTIAL_SIZE), H, accel - up_B, imu.accel_noise_density**2 * noise_factor / T)
     state.inject(dx)
     return state
 
 
-def carry(state: State, since: Preintegration) -> None:
+def propagate_position(state: State, since: Preintegration) -> None:
     """Propagate the position of a start from where it was last known, by the IMU since and the start's velocity and attitude.
 
     With p' = p + v T + g T^2/2 + R dp, v' = v + g T + R dv and R = R' dR^T of the start (R', v', p'):

@@ -25,13 +25,13 @@ from perch_perception.vio.bearing import POSITION as BY_POSITION
 from perch_perception.vio.bearing import THETA as BY_THETA
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.preintegration import preintegrate
-from perch_perception.vio.sliding import Sliding
+from perch_perception.vio.sliding import TrackWalk
 
 _G = np.array([0.0, 0.0, -GRAVITY])
 _ITERATIONS = 10
-_SETTLED = 0.01  # of chi^2
-_LEAST_POINTS = 6
-_DIFFERENT = float(chi2_quantile(0.99, 5))
+_CONVERGED = 0.01  # of chi^2
+_MIN_POINTS = 6
+_DISTINCT_GATE = float(chi2_quantile(0.99, 5))
 _TRACK_PROBABILITY = 0.999
 # of the unknowns: tilt (2), velocity, biases, calibration, then 9 for the noise of each interval; those with a prior are in its sigmas
 _TILT, _VELOCITY, _BIASES, _CALIBRATION, _NOISE = slice(0, 2), slice(2, 5), slice(5, 11), slice(11, 22), 22
@@ -39,7 +39,7 @@ _TIME_OFFSET = _CALIBRATION.start + 6
 
 
 @dataclass(frozen=True)
-class Sight:
+class PointObservations:
     """Observations of a point: indices of the frames in the stretch, shape (m,), bearings, and position in W, shape (3,)."""
 
     frames: np.ndarray
@@ -76,10 +76,10 @@ class Refined:
     scale: float
     cost: float
 
-    def differs_from(self, other: Refined) -> bool:
+    def is_distinct_from(self, other: Refined) -> bool:
         """Whether tilt or velocity differ from those of another by more than both covariances explain."""
         d = np.concatenate([np.cross(self.R_WB[2], other.R_WB[2]), self.v_B - other.v_B])
-        return bool(d @ np.linalg.solve(self.covariance[:6, :6] + other.covariance[:6, :6] + 1e-6 * np.eye(6), d) > _DIFFERENT)
+        return bool(d @ np.linalg.solve(self.covariance[:6, :6] + other.covariance[:6, :6] + 1e-6 * np.eye(6), d) > _DISTINCT_GATE)
 
 
 @dataclass
@@ -119,8 +119,8 @@ class _Linear:
     cost: float
 
 
-def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], sights: Sequence[Sight], R_WB: np.ndarray, v_WB: np.ndarray,
-           gyro_bias: np.ndarray, accel_bias: np.ndarray, known_bias: np.ndarray) -> Refined | None:
+def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], sights: Sequence[PointObservations],
+           R_WB: np.ndarray, v_WB: np.ndarray, gyro_bias: np.ndarray, accel_bias: np.ndarray, known_bias: np.ndarray) -> Refined | None:
     """Return the most likely state, from an initial guess.
 
     Args:
@@ -140,11 +140,11 @@ def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], s
     z = np.zeros(_NOISE + 9 * len(steps))
     s = _Unknowns(R_WB, v_WB, np.concatenate([gyro_bias, accel_bias]), mount.R_BC, mount.p_BC, z, np.array([x.X_W for x in sights]))
     z[_BIASES] = (s.biases - np.concatenate([known_bias, np.zeros(3)])) / sigma[:6]
-    sliding = Sliding(config.filter, mount.camera.fx)
+    track_walk = TrackWalk(config.filter, mount.camera.fx)
     variance = (config.filter.pixel_noise / mount.camera.fx) ** 2
     used = np.ones(len(sights), bool)
     while True:
-        linearised = partial(_linearised, steps=steps, sights=sights, used=used, sliding=sliding, variance=variance, sigma=sigma)
+        linearised = partial(_linearised, steps=steps, sights=sights, used=used, track_walk=track_walk, variance=variance, sigma=sigma)
         end = _descend(s, linearised, sigma, used)
         if end is None:
             return None
@@ -154,7 +154,7 @@ def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], s
         if (good == used).all():
             break
         used = good
-        if used.sum() < _LEAST_POINTS:
+        if used.sum() < _MIN_POINTS:
             return None
     misfit = (here.distances.sum() + s.z @ s.z) / (here.dof.sum() - 5)
     m = np.array([len(x.frames) for x in sights])[~used]
@@ -177,7 +177,7 @@ def _descend(s: _Unknowns, linearise: Callable[[_Unknowns], _Linear | None], sig
             damping *= 10.0
             continue
         gained, s, here, damping = here.cost - there.cost, onward, there, 0.1 * damping
-        if gained < _SETTLED:
+        if gained < _CONVERGED:
             return s, here
     return None
 
@@ -196,7 +196,7 @@ def _integrate(s: _Unknowns, steps: Sequence[np.ndarray], sigma: np.ndarray) -> 
     R, p, v, w = np.empty((n, 3, 3)), np.zeros((n, 3)), np.empty((n, 3)), np.zeros((n, 3))
     D = np.zeros((n, 9, k))  # of theta, p, v
     R[0], v[0] = s.R_WB, s.v_WB
-    D[0, :3, _TILT], D[0, 6:, _VELOCITY] = _level(s.R_WB), np.eye(3)
+    D[0, :3, _TILT], D[0, 6:, _VELOCITY] = _tilt_axes(s.R_WB), np.eye(3)
     for i, rows in enumerate(steps):
         pre = preintegrate(rows, s.biases[:3], s.biases[3:])
         T = pre.duration
@@ -220,13 +220,13 @@ def _integrate(s: _Unknowns, steps: Sequence[np.ndarray], sigma: np.ndarray) -> 
     return _Motion(R, p, v, D, w)
 
 
-def _level(R_WB: np.ndarray) -> np.ndarray:
+def _tilt_axes(R_WB: np.ndarray) -> np.ndarray:
     """Return two rotation vectors in B orthogonal to up, i.e. the turns that gravity makes observable, shape (3, 2)."""
     return R_WB.T[:, :2]
 
 
-def _linearised(s: _Unknowns, steps: Sequence[np.ndarray], sights: Sequence[Sight], used: np.ndarray, sliding: Sliding, variance: float,
-                sigma: np.ndarray) -> _Linear | None:
+def _linearised(s: _Unknowns, steps: Sequence[np.ndarray], sights: Sequence[PointObservations], used: np.ndarray,
+                track_walk: TrackWalk, variance: float, sigma: np.ndarray) -> _Linear | None:
     """Return the normal equations at given unknowns; None where a point is not in front of a camera."""
     motion = _integrate(s, steps, sigma)
     chosen = [x for x, ok in zip(sights, used) if ok]
@@ -250,10 +250,10 @@ def _linearised(s: _Unknowns, steps: Sequence[np.ndarray], sights: Sequence[Sigh
     lens = s.z[_CALIBRATION.start + 7 : _CALIBRATION.stop] * sigma[13:]
     moved = pose @ np.concatenate([motion.w_B, motion.v_WB], axis=1)[f][:, :, None] * (offset * sigma[12])
     A[:, :, -1] = now.r - moved[:, :, 0] - now.J[:, :, 7:11] @ lens
-    walk = sliding.steps(seen.b_C[:-1], seen.b_C[1:], now.distance[:-1], now.distance[1:])
+    walk = track_walk.steps(seen.b_C[:-1], seen.b_C[1:], now.distance[:-1], now.distance[1:])
     rows, rests, points, ends = [], [], [], np.cumsum(count)
     for begin, end in zip(ends - count, ends):
-        white = sliding.whitened(walk[begin : end - 1], A[begin:end].reshape(end - begin, -1)).reshape(2 * (end - begin), -1)
+        white = track_walk.whitened(walk[begin : end - 1], A[begin:end].reshape(end - begin, -1)).reshape(2 * (end - begin), -1)
         R_f, H_1, r_1, H_0, r_0 = ekf.eliminate(white[:, 3:-1], white[:, :3], white[:, -1])
         rows.append(H_0)
         rests.append(r_0)
@@ -273,7 +273,7 @@ def _moved(s: _Unknowns, step: np.ndarray, sigma: np.ndarray, points: list, used
         X_W[j] += np.linalg.solve(R_f, r_1 - H_1 @ step)
     z[_BIASES.start :] += step[_BIASES.start :]
     camera = step[_CALIBRATION] * sigma[6:]
-    return _Unknowns(s.R_WB @ so3.exp(_level(s.R_WB) @ step[_TILT]), s.v_WB + step[_VELOCITY], s.biases + step[_BIASES] * sigma[:6],
+    return _Unknowns(s.R_WB @ so3.exp(_tilt_axes(s.R_WB) @ step[_TILT]), s.v_WB + step[_VELOCITY], s.biases + step[_BIASES] * sigma[:6],
                      s.R_BC @ so3.exp(camera[:3]), s.p_BC + camera[3:6], z, X_W)
 
 

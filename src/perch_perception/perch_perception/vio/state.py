@@ -27,7 +27,7 @@ _CAMERA = np.r_[THETA, POSITION, CAMERA_ROTATION, CAMERA_POSITION]  # what a poi
 
 
 @compiled
-def _gone_along(P, direction, scale):
+def _transformed_covariance(P, direction, scale):
     """Return M P M^T with M = I + direction scale^T, both vectors of shape (n,)."""
     n = len(P)
     q = P @ scale
@@ -54,7 +54,7 @@ class Landmark:
     """A point in the state: position in W (3,), number of consecutive refusals."""
 
     X_W: np.ndarray
-    strikes: int = 0
+    consecutive_refusals: int = 0
 
 
 @dataclass
@@ -105,13 +105,13 @@ class State:
         The direction of a change of scale (`scale_direction`) depends on the estimate as well, and is transformed with it.
         """
         direction = self.scale_direction()
-        carry = self._move(dx)
-        P = carry(np.ascontiguousarray(carry(self.P).T))
+        transport = self._move(dx)
+        P = transport(np.ascontiguousarray(transport(self.P).T))
         self.P = 0.5 * (P + P.T)
         scale = self.scale_error()
         if scale is not None:
-            carried = carry(direction[:, None])[:, 0]
-            self.P = _gone_along(self.P, self.scale_direction() - carried, scale / (scale @ carried))
+            transported = transport(direction[:, None])[:, 0]
+            self.P = _transformed_covariance(self.P, self.scale_direction() - transported, scale / (scale @ transported))
 
     def _move(self, dx: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """Move all estimates; return the function that transforms errors accordingly, rows (size, n) to rows."""
@@ -122,7 +122,7 @@ class State:
         poses = np.zeros((len(where), CLONE_SIZE, CLONE_SIZE))
         poses[:, :3, :3], poses[:, 3:, 3:], poses[:, 3:, :3] = E.transpose(0, 2, 1), np.eye(3), -so3.hat(steps[:, 3:]) @ R
         velocity = so3.hat(dx[VELOCITY]) @ self.R_WB
-        before = self._see(np.array([m.X_W for m in marks]).reshape(-1, 3))
+        before = self._to_camera(np.array([m.X_W for m in marks]).reshape(-1, 3))
         X_C, S = camera_frame.moved(before.X_C, before.by_camera @ dx[_CAMERA] + dx[start:].reshape(-1, 3) @ before.R_CW.T)
 
         R = R @ E
@@ -138,9 +138,9 @@ class State:
         X_W = self.p_WB + (self.p_BC + X_C @ self.R_BC.T) @ self.R_WB.T
         for mark, X in zip(marks, X_W):
             mark.X_W = X
-        by_camera, by_moved, by_point = camera_frame.carried(before, self._see(X_W), S)
+        by_camera, by_moved, by_point = camera_frame.error_transport(before, self._to_camera(X_W), S)
 
-        def carry(rows: np.ndarray) -> np.ndarray:
+        def transport(rows: np.ndarray) -> np.ndarray:
             out = rows.copy()
             out[where] = poses @ rows[where]
             out[VELOCITY] -= velocity @ rows[THETA]
@@ -149,10 +149,10 @@ class State:
             out[start:] = by_camera @ rows[_CAMERA] - by_moved @ out[_CAMERA] + points.reshape(3 * len(marks), rows.shape[1])
             return out
 
-        return carry
+        return transport
 
-    def _see(self, X_W: np.ndarray) -> camera_frame.Seen:
-        return camera_frame.see(self.R_WB, self.p_WB, self.R_BC, self.p_BC, X_W)
+    def _to_camera(self, X_W: np.ndarray) -> camera_frame.CameraPoints:
+        return camera_frame.transform_to_camera(self.R_WB, self.p_WB, self.R_BC, self.p_BC, X_W)
 
     def scale_error(self) -> np.ndarray | None:
         """Return the gradient of s = scale^T dx, the relative deficit of all lengths: the mean over the landmarks of d ln |X_C|.
@@ -166,7 +166,7 @@ class State:
         """
         if len(self.landmarks) < 3:
             return None
-        seen = self._see(np.array([m.X_W for m in self.landmarks.values()]))
+        seen = self._to_camera(np.array([m.X_W for m in self.landmarks.values()]))
         by_X_C = seen.X_C / (seen.X_C**2).sum(axis=1, keepdims=True) / len(seen.X_C)
         out = np.zeros(self.size)
         out[_CAMERA] = np.einsum("mi,mij->j", by_X_C, seen.by_camera)
@@ -194,10 +194,10 @@ class State:
             cross: covariance of its error with the state's, shape (3, size).
             own: its covariance, shape (3, 3).
         """
-        before = self._see(X_W[None])
+        before = self._to_camera(X_W[None])
         X_C, S = camera_frame.moved(before.X_C, (before.R_CW @ step)[None])
         X_W = self.p_WB + self.R_WB @ (self.p_BC + self.R_BC @ X_C[0])
-        by_camera, by_moved, by_point = camera_frame.carried(before, self._see(X_W[None]), S)
+        by_camera, by_moved, by_point = camera_frame.error_transport(before, self._to_camera(X_W[None]), S)
         by_camera, by_point = by_camera - by_moved, by_point[0]
         moved = by_camera @ self.P[_CAMERA] + by_point @ cross
         own = by_camera @ moved[:, _CAMERA].T + by_point @ (cross[:, _CAMERA] @ by_camera.T + own @ by_point.T)

@@ -7,8 +7,8 @@ a participant may be in another process, with which the schedule exchanges only 
 from perch_sim.lockstep.batches import Arrival
 from perch_sim.lockstep.packet import Codec, Packet
 from perch_sim.lockstep.participant import Answer, LocalParticipant, Participant, local_servers
-from perch_sim.lockstep.schedule import Owed, Schedule
-from perch_sim.lockstep.tasks import BEGUN, START, Task, flight_tasks, is_slow
+from perch_sim.lockstep.schedule import PendingInput, Schedule
+from perch_sim.lockstep.tasks import START, START_DEADLINE, Task, flight_tasks, is_slow
 
-__all__ = ["BEGUN", "START", "Answer", "Arrival", "Codec", "LocalParticipant", "Owed", "Packet", "Participant", "Schedule", "Task",
-           "flight_tasks", "is_slow", "local_servers"]
+__all__ = ["START", "START_DEADLINE", "Answer", "Arrival", "Codec", "LocalParticipant", "Packet", "Participant", "PendingInput",
+           "Schedule", "Task", "flight_tasks", "is_slow", "local_servers"]

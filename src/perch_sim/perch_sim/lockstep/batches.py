@@ -1,4 +1,4 @@
-"""Batches of packets for slow participants, begun when their images are rendered, and places in the order of a flight."""
+"""Batches of packets for slow participants, begun when their images are rendered, and slots in the order of a flight."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class Batch:
         self.results: Sequence[Packet] = ()
 
 
-class Place:
-    """Place of a participant in the order, occupied or empty.
+class Slot:
+    """Slot of a participant in the order, occupied or empty.
 
     Attributes:
         inbox: packets received since the last batch.
-        coming: batches of a slow participant without results, oldest first; one at a time is processed.
+        pending: batches of a slow participant without results, oldest first; one at a time is processed.
         done: batches of a slow participant whose results are not due yet.
         last: step of the last batch.
     """
@@ -54,7 +54,7 @@ class Place:
         self.latency = 0 if task.latency is None else round(task.latency * 1e9)
         self.participant: Participant | None = None
         self.inbox: list[Packet] = []
-        self.coming: deque[Batch] = deque()
+        self.pending: deque[Batch] = deque()
         self.done: deque[Batch] = deque()
         self.last = 0
 
@@ -68,7 +68,7 @@ class Place:
         """Whether its participant has images among its inputs."""
         return any(channel.endswith("/image_raw") for channel in self.inputs)
 
-    def awaits(self, arrival: Arrival) -> bool:
+    def is_triggered_by(self, arrival: Arrival) -> bool:
         """Return whether a frame triggers work; a participant that takes images requires the image."""
         if f"camera_{arrival.camera}/image_raw" in self.inputs:
             return arrival.image is not None
@@ -79,15 +79,15 @@ def _is_image(packet: Packet) -> bool:
     return packet.channel.endswith("/image_raw")
 
 
-def is_drawn(image: CameraImage, timeout: float = 0.0) -> bool:
+def is_rendered(image: CameraImage, timeout: float = 0.0) -> bool:
     """Return whether an image has been rendered; wait for it up to a time [s]."""
     return image.ready is None or image.ready(timeout)
 
 
-def first_undrawn(batch: Batch) -> Packet | None:
+def first_pending_image(batch: Batch) -> Packet | None:
     """Return the first packet of a batch whose image is still being rendered, or None."""
     return next((packet for packet in batch.packets
-                 if _is_image(packet) and not is_drawn(packet.value)), None)
+                 if _is_image(packet) and not is_rendered(packet.value)), None)
 
 
 def is_lost(packet: Packet) -> bool:

@@ -22,8 +22,8 @@ from perch_sim.lockstep.packet import Codec, Packet
 _BATCH, _PACKET = struct.Struct("<qI"), struct.Struct("<HI")  # stamp [ns] and number of packets; lengths of channel and data [byte]
 _PEER = struct.Struct("3i")                                   # process, user, group
 
-_SEND_LIMIT = struct.pack("ll", 0, 20_000)                    # a participant that does not read is not waited for longer [s, us]
-_LENGTH = struct.Struct("!i")                                 # of a message, as multiprocessing has it
+_SEND_LIMIT = struct.pack("ll", 0, 20_000)                    # longest wait for a participant that does not read [s, us]
+_LENGTH = struct.Struct("!i")                                 # of a message, as in multiprocessing
 
 
 def address(domain: str, namespace: str) -> str:
@@ -53,16 +53,16 @@ def unpack(data: bytes, codec: Codec) -> tuple[int, list[Packet]]:
             name, length = _PACKET.unpack_from(data, offset)
             offset += _PACKET.size
             if offset + name + length > len(data):
-                raise PerchError(f"lockstep: {len(data)} bytes are no batch: they end within a packet")
+                raise PerchError(f"lockstep: {len(data)} bytes are not a batch: they end within a packet")
             channel, offset = data[offset:offset + name].decode(), offset + name
             packets.append(Packet.received(channel, data[offset:offset + length], codec))
             offset += length
     except (struct.error, UnicodeDecodeError) as error:
-        raise PerchError(f"lockstep: {len(data)} bytes are no batch: {error}") from None
+        raise PerchError(f"lockstep: {len(data)} bytes are not a batch: {error}") from None
     return stamp, packets
 
 
-class Door:
+class ParticipantListener:
     """The vehicle's listening socket, which accepts participants."""
 
     def __init__(self, where: str) -> None:
@@ -76,17 +76,17 @@ class Door:
             if error.errno != errno.EADDRINUSE:
                 raise PerchError(f"lockstep: cannot listen at {where[1:]!r}: {error}") from None
             raise PerchError("another vehicle runs a lockstep in this ROS domain and namespace") from None
-        self._socket: socket.socket = self._listener._listener._socket  # type: ignore[attr-defined]  # it accepts without waiting
+        self._socket: socket.socket = self._listener._listener._socket  # type: ignore[attr-defined]  # non-blocking accept
         self._socket.setblocking(False)
 
-    def let_in(self) -> list[tuple[str, frozenset[str], Connection]]:
+    def accept(self) -> list[tuple[str, frozenset[str], Connection]]:
         """Return the participants that have connected since the last call: name, input channels and connection."""
-        found: list[tuple[str, frozenset[str], Connection]] = []
+        accepted: list[tuple[str, frozenset[str], Connection]] = []
         while True:
             try:
                 connection = self._listener.accept()
             except (BlockingIOError, OSError):
-                return found
+                return accepted
             try:
                 with socket.socket(fileno=os.dup(connection.fileno())) as peer:
                     user = _PEER.unpack(peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
@@ -94,7 +94,7 @@ class Door:
                 if user != os.getuid() or not connection.poll(1.0):
                     raise OSError("not the same user, or silent")
                 greeting = json.loads(connection.recv_bytes(1 << 16))
-                found.append((str(greeting["node"]), frozenset(map(str, greeting["inputs"])), connection))
+                accepted.append((str(greeting["node"]), frozenset(map(str, greeting["inputs"])), connection))
             except (OSError, EOFError, ValueError, KeyError, TypeError):
                 connection.close()
 
@@ -103,12 +103,12 @@ class Door:
         self._listener.close()
 
 
-class Sending:
+class NonBlockingSender:
     """Sends messages over a connection without waiting for a process that hangs; the rest is sent when it reads again."""
 
     def __init__(self, connection: Connection) -> None:
         self._socket = socket.socket(fileno=os.dup(connection.fileno()))
-        self._rest = memoryview(b"")
+        self._unsent = memoryview(b"")
 
     def send(self, data: bytes) -> None:
         """Send a message, with at most `_SEND_LIMIT` of waiting for the reader; the previous one must have been read.
@@ -116,25 +116,25 @@ class Sending:
         Raises:
             OSError: the other end has closed the connection.
         """
-        self._rest = memoryview(_LENGTH.pack(len(data)) + data)
-        self.go_on(0)
+        self._unsent = memoryview(_LENGTH.pack(len(data)) + data)
+        self.flush(0)
 
-    def go_on(self, flags: int = socket.MSG_DONTWAIT) -> None:
+    def flush(self, flags: int = socket.MSG_DONTWAIT) -> None:
         """Send as much of the rest as possible.
 
         Raises:
             OSError: the other end has closed the connection.
         """
         with suppress(BlockingIOError):
-            while self._rest:
-                self._rest = self._rest[self._socket.send(self._rest, flags):]
+            while self._unsent:
+                self._unsent = self._unsent[self._socket.send(self._unsent, flags):]
 
     def close(self) -> None:
         """Close the sending socket."""
         self._socket.close()
 
 
-def knock(where: str, name: str, inputs: frozenset[str]) -> Connection | None:
+def connect_to_vehicle(where: str, name: str, inputs: frozenset[str]) -> Connection | None:
     """Connect a participant to the vehicle; return None if there is no vehicle."""
     with suppress(OSError):
         connection = Client(where, "AF_UNIX")
@@ -143,7 +143,7 @@ def knock(where: str, name: str, inputs: frozenset[str]) -> Connection | None:
     return None
 
 
-class Waiting:
+class ConnectionPoll:
     """Waits for data on several connections. `Connection.poll` creates a selector for each call, which takes 0.1 ms."""
 
     def __init__(self) -> None:

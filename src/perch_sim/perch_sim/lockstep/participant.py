@@ -11,7 +11,7 @@ from perch_core.component import Action, Client, Component, Input, Output, Servi
 from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS
 from perch_sim.lockstep.packet import Codec, Packet
-from perch_sim.lockstep.tasks import BEGUN
+from perch_sim.lockstep.tasks import START_DEADLINE
 
 
 class Participant(Protocol):
@@ -36,7 +36,7 @@ class Participant(Protocol):
     def results(self) -> list[Packet] | None:
         """Return the packets from the batch, in the order of emission, once; None while the work continues. Never blocks."""
 
-    def listen(self, taken: Callable[[str], bool]) -> None:
+    def set_channel_filter(self, is_taken: Callable[[str], bool]) -> None:
         """Set the check whether a channel has a receiver; packets without one need not be emitted."""
 
 
@@ -50,7 +50,7 @@ class Future(Protocol):
         """Return the answer; raises the exception of a failed request."""
 
 
-Ask = Callable[[str, Any], Future]  # (channel of the service, request)
+SendRequest = Callable[[str, Any], Future]  # (channel of the service, request)
 
 
 class Answer:
@@ -90,17 +90,17 @@ class Emissions:
             if port not in (Component.log, Component.diagnostics):
                 channel = port.channel(component)
                 self._receivers.append((channel, getattr(component, port.name).receivers, self._receiver(channel, codec)))
-        self.listen(lambda channel: True)
+        self.set_channel_filter(lambda channel: True)
 
     def _receiver(self, channel: str, codec: Codec | None) -> Callable[[Any], None]:
         append = self._packets.append
         return lambda value: append(Packet(channel, value, codec))
 
-    def listen(self, taken: Callable[[str], bool]) -> None:
-        """Collect the channels for which `taken` returns True, and no others."""
+    def set_channel_filter(self, is_taken: Callable[[str], bool]) -> None:
+        """Collect the channels for which `is_taken` returns True, and no others."""
         for channel, receivers, receive in self._receivers:
-            if (receive in receivers) != taken(channel):
-                receivers.append(receive) if taken(channel) else receivers.remove(receive)
+            if (receive in receivers) != is_taken(channel):
+                receivers.append(receive) if is_taken(channel) else receivers.remove(receive)
 
     def take(self) -> list[Packet]:
         """Return the packets emitted since the last call."""
@@ -131,33 +131,33 @@ class LocalParticipant(Participant):
     for a goal.
     """
 
-    def __init__(self, component: Component[Any], codec: Codec | None = None, ask: Ask | None = None, hold: str = "", *,
-                 name: str = "") -> None:
+    def __init__(self, component: Component[Any], codec: Codec | None = None, send_request: SendRequest | None = None,
+                 await_goal: str = "", *, name: str = "") -> None:
         """
         Args:
             component: component, which must have no other host; its jobs run at once.
             codec: codec of its packets; None: they never leave this process.
-            ask: sends the component's requests to their servers; None: there are no servers.
-            hold: name of an action: the flight begins with its first goal, unless the participant joins a flight under way.
+            send_request: sends the component's requests to their servers; None: there are no servers.
+            await_goal: name of an action: the flight begins with its first goal, unless the participant joins a flight under way.
             name: name of its task in the schedule; empty: that of the class, in lower case with underscores.
 
         Raises:
-            PerchError: two inputs have the same channel, or `hold` is not an action.
+            PerchError: two inputs have the same channel, or `await_goal` is not an action.
         """
         kind = type(component)
         self.component, self.name = component, name or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower()
         self._handlers = handlers(component)
         self.inputs = frozenset(self._handlers)
         self._emissions = Emissions(component, codec)
-        self._ask = ask or local_servers(())
-        self._wakes: list[list[Any]] = [[0, round(port.period * NANOSECONDS), port.handler(component)] for port in ports(kind, Timer)]
-        self._outside: deque[Callable[[], None]] = deque()  # requests and goals, in front of the next batch
+        self._send_request = send_request or local_servers(())
+        self._timers: list[list[Any]] = [[0, round(port.period * NANOSECONDS), port.handler(component)] for port in ports(kind, Timer)]
+        self._external_calls: deque[Callable[[], None]] = deque()  # requests and goals, in front of the next batch
         self._awaited: list[_Awaited] = []
         self._now, self._begun = 0, False
         self._batch: Iterator[Packet] | None = None  # what is left of it
-        self._hold = hold
-        if hold and hold not in (port.name for port in ports(kind, Action)):
-            raise PerchError(f"{self.name}: {hold!r} is none of its actions")
+        self._await_goal = await_goal
+        if await_goal and await_goal not in (port.name for port in ports(kind, Action)):
+            raise PerchError(f"{self.name}: {await_goal!r} is not one of its actions")
         component.work = run_now
         for port in ports(kind, Client):
             setattr(component, port.name, self._client(port))
@@ -166,45 +166,45 @@ class LocalParticipant(Participant):
 
     def begin(self, now: int, batch: Sequence[Packet]) -> None:
         """Process a batch, or wait for the goal or the answers that it needs."""
-        if now > BEGUN:
-            self._hold = ""
+        if now > START_DEADLINE:
+            self._await_goal = ""
         self._now, self._batch, self._begun = now, iter(batch), True
-        self._go_on()
+        self._continue_batch()
 
     def results(self) -> list[Packet] | None:
         """Return the packets from the batch; None while it waits for an answer or its first goal."""
         if self._batch is not None:
-            self._go_on()
+            self._continue_batch()
             if self._batch is not None:
                 return None
         return self._emissions.take()
 
-    def listen(self, taken: Callable[[str], bool]) -> None:
-        """Emit only on channels for which `taken` returns True."""
-        self._emissions.listen(taken)
+    def set_channel_filter(self, is_taken: Callable[[str], bool]) -> None:
+        """Emit only on channels for which `is_taken` returns True."""
+        self._emissions.set_channel_filter(is_taken)
 
-    def _go_on(self) -> None:
-        if self._outside or self._awaited or self._hold:
-            if self._hold or not all(awaited.answer.done() for awaited in self._awaited if awaited.due <= self._now):
+    def _continue_batch(self) -> None:
+        if self._external_calls or self._awaited or self._await_goal:
+            if self._await_goal or not all(awaited.answer.done() for awaited in self._awaited if awaited.due <= self._now):
                 return
-            self._take_what_came()
+            self._deliver_pending()
         now, handle = self._now, self._handlers
-        for packet in self._batch or ():  # where the component fails on one, the next call goes on with those behind it
+        for packet in self._batch or ():  # if the component fails on one, the next call continues behind it
             handle[packet.channel](packet.value)
-        for wake in self._wakes:
-            if now >= wake[0]:
-                wake[0] = wake[0] + wake[1] if wake[0] + wake[1] > now else now + wake[1]
-                wake[2](now)
+        for timer in self._timers:
+            if now >= timer[0]:
+                timer[0] = timer[0] + timer[1] if timer[0] + timer[1] > now else now + timer[1]
+                timer[2](now)
         self._batch = None
 
-    def _take_what_came(self) -> None:
-        while self._outside:
-            self._outside.popleft()()
+    def _deliver_pending(self) -> None:
+        while self._external_calls:
+            self._external_calls.popleft()()
         for awaited in [awaited for awaited in self._awaited if awaited.due <= self._now]:
-            self._awaited.remove(awaited)  # one by one: where the component fails on one, the others remain
+            self._awaited.remove(awaited)  # one by one: if the component fails on one, the others remain
             try:
                 answer = awaited.answer.result()
-            except Exception as error:  # whatever befell a server, it is no answer
+            except Exception as error:  # any failure of a server
                 answer = Unavailable(f"{type(error).__name__}: {error}")
             awaited.take(answer)
 
@@ -225,19 +225,19 @@ class LocalParticipant(Participant):
         """
         handler = self._port(Action, port_name).handler(self.component)
 
-        def hand_over() -> None:
+        def deliver() -> None:
             rejected = handler(goal)
             if answered is not None:
                 answered(rejected)
 
-        self.enter(port_name, hand_over)
+        self.enter(port_name, deliver)
 
     def enter(self, port_name: str, call: Callable[[], None]) -> None:
         """Schedule a call that passes a request or a goal to the port, as `request` does."""
-        if port_name == self._hold:
-            self._hold = ""
+        if port_name == self._await_goal:
+            self._await_goal = ""
         if self._begun:
-            self._outside.append(call)
+            self._external_calls.append(call)
         else:
             call()
 
@@ -249,29 +249,29 @@ class LocalParticipant(Participant):
         for port in ports(type(self.component), kind):  # type: ignore[var-annotated]  # of whatever kind
             if port.name == name:
                 return port
-        raise PerchError(f"{self.name}: {name!r} is none of its ports of type {kind.__name__}")
+        raise PerchError(f"{self.name}: {name!r} is not one of its ports of type {kind.__name__}")
 
     def _client(self, port: Client[Any, Any]) -> Callable[..., None]:
         channel, take = port.channel(self.component), port.handler(self.component)
 
         def send(request: Any, due: int = 0) -> None:
-            self._awaited.append(_Awaited(due, take, self._ask(channel, request)))
+            self._awaited.append(_Awaited(due, take, self._send_request(channel, request)))
 
         return send
 
 
-def local_servers(servers: Iterable[LocalParticipant]) -> Ask:
+def local_servers(servers: Iterable[LocalParticipant]) -> SendRequest:
     """Return a function that sends requests to components in this process."""
-    known = list(servers)
+    participants = list(servers)
 
-    def ask(channel: str, request: Any) -> Future:
+    def send_request(channel: str, request: Any) -> Future:
         answer = Answer()
-        for server in known:
+        for server in participants:
             name = server.serves(channel)
             if name is not None:
                 server.request(name, request, answer)
                 return answer
-        answer(Unavailable(f"nobody serves {channel!r}"))
+        answer(Unavailable(f"no server for {channel!r}"))
         return answer
 
-    return ask
+    return send_request

@@ -22,19 +22,19 @@ from typing import Any, NamedTuple, Protocol, cast
 from perch_core.component import Component
 from perch_core.errors import PerchError
 from perch_core.values import CameraImage
-from perch_sim.lockstep.batches import Arrival, Batch, Place, first_undrawn, is_drawn, is_lost
+from perch_sim.lockstep.batches import Arrival, Batch, Slot, first_pending_image, is_lost, is_rendered
 from perch_sim.lockstep.packet import Codec, Packet
 from perch_sim.lockstep.participant import Emissions, Participant, handlers
 from perch_sim.lockstep.tasks import Task
 from perch_sim.timing import CONTROL_PERIOD_NS
 
-MOST_UNDRAWN = 2            # frames of a camera that have arrived before their images
-LONGEST_SILENCE = 500       # steps without a frame after which a participant gets what has come to it all the same
+MAX_PENDING_IMAGES = 2         # frames of a camera that have arrived before their images
+MAX_STEPS_WITHOUT_FRAME = 500  # after so many, a participant receives its inbox without a frame
 LATCHED = ("/tf_static", "target/pose", "powerlines", "ground_truth/target")
 _CHANNEL = attrgetter("channel")
 
 
-class Owed(NamedTuple):
+class PendingInput(NamedTuple):
     """A missing input for which the flight waits: name of its source, description, and stamp [ns]."""
 
     name: str
@@ -87,23 +87,23 @@ class Schedule:
         self._vehicle = cast(Vehicle, vehicle)
         self._vehicle_handlers = handlers(vehicle)
         self._emissions = Emissions(vehicle, codec)
-        self._places = {name: Place(name, task) for name, task in tasks.items()}
-        self._fast = [place for place in self._places.values() if place.task.latency is None]
-        self._slow = [place for place in self._places.values() if place.task.latency is not None]
+        self._slots = {name: Slot(name, task) for name, task in tasks.items()}
+        self._fast = [slot for slot in self._slots.values() if slot.task.latency is None]
+        self._slow = [slot for slot in self._slots.values() if slot.task.latency is not None]
         self._latest: dict[str, list[Packet]] = {}
-        self._undrawn: dict[str, deque[CameraImage]] = {}
-        self._awaited: Place | None = None  # fast participant whose answer is missing
-        self._routes = _Routes(self._takers)
+        self._pending_images: dict[str, deque[CameraImage]] = {}
+        self._awaited: Slot | None = None  # fast participant whose answer is missing
+        self._routes = _Routes(self._receivers)
         for participant in participants:
             self.join(participant)
         self._steps = self._flight()
 
-    # -- who takes part ----------------------------------------------------------------------------------------------
+    # -- participants ------------------------------------------------------------------------------------------------
 
     @property
     def names(self) -> list[str]:
         """Names of the participants, in the order in which they work within a step."""
-        return [name for name, place in self._places.items() if place.participant is not None]
+        return [name for name, slot in self._slots.items() if slot.participant is not None]
 
     def join(self, participant: Participant) -> None:
         """Add a participant, or replace the one of the same name, whose pending results are discarded.
@@ -113,78 +113,78 @@ class Schedule:
         Raises:
             PerchError: there is no task for its name.
         """
-        if participant.name not in self._places:
-            raise PerchError(f"{participant.name!r} is not one of {', '.join(self._places)}")
+        if participant.name not in self._slots:
+            raise PerchError(f"{participant.name!r} is not one of {', '.join(self._slots)}")
         self.drop(participant.name)
-        place = self._places[participant.name]
-        place.participant, place.last = participant, self.index
+        slot = self._slots[participant.name]
+        slot.participant, slot.last = participant, self.index
         for channel in sorted(self._latest):
             if channel in participant.inputs:
-                place.inbox += self._latest[channel]
+                slot.inbox += self._latest[channel]
         self._reroute()
 
     def drop(self, name: str) -> None:
         """Remove a participant, and discard its pending results."""
-        place = self._places[name]
-        place.participant = None
-        for queue in (place.inbox, place.coming, place.done):
+        slot = self._slots[name]
+        slot.participant = None
+        for queue in (slot.inbox, slot.pending, slot.done):
             queue.clear()
         self._reroute()
 
     def _reroute(self) -> None:
         self._routes.clear()
-        taken = {channel for place in self._places.values() for channel in place.inputs}
+        taken = {channel for slot in self._slots.values() for channel in slot.inputs}
         taken |= set(self._vehicle_handlers)
 
         def is_taken(channel: str) -> bool:
             return channel in taken or _is_latched(channel)
 
-        self._emissions.listen(is_taken)
-        for place in self._places.values():
-            if place.participant is not None:
-                place.participant.listen(is_taken)
+        self._emissions.set_channel_filter(is_taken)
+        for slot in self._slots.values():
+            if slot.participant is not None:
+                slot.participant.set_channel_filter(is_taken)
 
-    def _takers(self, channel: str) -> list[Callable[[Packet], None]]:
-        takers: list[Callable[[Packet], None]] = [
-            place.inbox.append for place in self._places.values() if channel in place.inputs]
+    def _receivers(self, channel: str) -> list[Callable[[Packet], None]]:
+        receivers: list[Callable[[Packet], None]] = [
+            slot.inbox.append for slot in self._slots.values() if channel in slot.inputs]
         if channel in self._vehicle_handlers:
             handle = self._vehicle_handlers[channel]
-            takers.append(lambda packet: handle(packet.value))
+            receivers.append(lambda packet: handle(packet.value))
         if _is_latched(channel):
-            takers.append(self._keep)
-        return takers
+            receivers.append(self._latch)
+        return receivers
 
-    def _keep(self, packet: Packet) -> None:
-        kept = self._latest.setdefault(packet.channel, [])
-        if packet.channel != "/tf_static":  # one transform each: all of them count
-            kept.clear()
-        kept.append(packet)
+    def _latch(self, packet: Packet) -> None:
+        latched = self._latest.setdefault(packet.channel, [])
+        if packet.channel != "/tf_static":  # one transform each: all are kept
+            latched.clear()
+        latched.append(packet)
 
-    # -- going on ----------------------------------------------------------------------------------------------------
+    # -- stepping ----------------------------------------------------------------------------------------------------
 
     def advance(self) -> bool:
         """Continue the flight, by at most one control period.
 
         Returns:
-            True: a control period has been completed. False: something is `owed`; call again when it may have arrived.
+            True: a control period has been completed. False: something is `pending`; call again when it may have arrived.
         """
-        for place in self._slow:
-            if place.coming:
-                self._work(place)
+        for slot in self._slow:
+            if slot.pending:
+                self._work(slot)
         return next(self._steps)
 
-    def owed(self) -> list[Owed]:
+    def pending(self) -> list[PendingInput]:
         """Return what the flight waits for, after `advance` has returned False."""
         if self._awaited is not None:
-            return [Owed(self._awaited.name, "its answer to the present step", self.now)]
-        missing = [Owed(f"camera_{camera}", "an image", images[0].stamp)
-                   for camera, images in self._undrawn.items() if len(images) > MOST_UNDRAWN]
-        for place in self._slow:
-            if place.coming and place.coming[0].due <= self.now:
-                batch = place.coming[0]
-                image = None if batch.begun else first_undrawn(batch)
-                missing.append(Owed(place.name, "its results", batch.stamp) if image is None
-                               else Owed(image.channel.split("/")[0], f"an image for {place.name}", image.value.stamp))
+            return [PendingInput(self._awaited.name, "its answer to the present step", self.now)]
+        missing = [PendingInput(f"camera_{camera}", "an image", images[0].stamp)
+                   for camera, images in self._pending_images.items() if len(images) > MAX_PENDING_IMAGES]
+        for slot in self._slow:
+            if slot.pending and slot.pending[0].due <= self.now:
+                batch = slot.pending[0]
+                image = None if batch.begun else first_pending_image(batch)
+                missing.append(PendingInput(slot.name, "its results", batch.stamp) if image is None
+                               else PendingInput(image.channel.split("/")[0], f"an image for {slot.name}", image.value.stamp))
         return missing
 
     def await_image(self, timeout: float) -> bool:
@@ -193,15 +193,15 @@ class Schedule:
         Args:
             timeout: longest wait [s].
         """
-        for images in self._undrawn.values():
-            if len(images) > MOST_UNDRAWN:
-                is_drawn(images[0], timeout)
+        for images in self._pending_images.values():
+            if len(images) > MAX_PENDING_IMAGES:
+                is_rendered(images[0], timeout)
                 return True
-        for place in self._slow:
-            if place.coming and place.coming[0].due <= self.now and not place.coming[0].begun:
-                image = first_undrawn(place.coming[0])
+        for slot in self._slow:
+            if slot.pending and slot.pending[0].due <= self.now and not slot.pending[0].begun:
+                image = first_pending_image(slot.pending[0])
                 if image is not None:
-                    is_drawn(image.value, timeout)
+                    is_rendered(image.value, timeout)
                     return True
         return False
 
@@ -214,14 +214,14 @@ class Schedule:
             packets = emissions.take()
             if arrivals:
                 self._note_images(arrivals)
-                while self._crowded():
+                while self._rendering_behind():
                     yield False
             released: list[Packet] = []
-            for place in self._slow:
+            for slot in self._slow:
                 while True:
-                    while place.done and place.done[0].due <= now:
-                        released += place.done.popleft().results
-                    if not place.coming or place.coming[0].due > now:
+                    while slot.done and slot.done[0].due <= now:
+                        released += slot.done.popleft().results
+                    if not slot.pending or slot.pending[0].due > now:
                         break
                     yield False
             if len(released) > 1:
@@ -232,21 +232,21 @@ class Schedule:
             for packet in packets:
                 for take in routes[packet.channel]:
                     take(packet)
-            for place in self._fast:
-                if place.participant is None:
+            for slot in self._fast:
+                if slot.participant is None:
                     continue
-                worker, batch = place.participant, place.inbox.copy()
-                place.inbox.clear()
+                worker, batch = slot.participant, slot.inbox.copy()
+                slot.inbox.clear()
                 worker.begin(now, batch)
                 results = worker.results()
                 while results is None:
-                    self._awaited = place
+                    self._awaited = slot
                     yield False
-                    if place.participant is not worker:
-                        if place.participant is None:
+                    if slot.participant is not worker:
+                        if slot.participant is None:
                             break
-                        worker, batch = place.participant, place.inbox + batch
-                        place.inbox.clear()
+                        worker, batch = slot.participant, slot.inbox + batch
+                        slot.inbox.clear()
                         worker.begin(now, batch)
                     results = worker.results()
                 self._awaited = None
@@ -261,38 +261,38 @@ class Schedule:
 
     def _trigger(self, now: int, arrivals: Sequence[Arrival]) -> None:
         """Close the batches of slow participants whose work begins at this step."""
-        for place in self._slow:
-            if place.participant is None:
+        for slot in self._slow:
+            if slot.participant is None:
                 continue
             due = None
-            if place.task.period:
-                if self.index % place.task.period == 0:
-                    due = now + place.latency
+            if slot.task.period:
+                if self.index % slot.task.period == 0:
+                    due = now + slot.latency
             elif arrivals:
-                due = max((arrival.middle + place.latency for arrival in arrivals if place.awaits(arrival)), default=None)
+                due = max((arrival.middle + slot.latency for arrival in arrivals if slot.is_triggered_by(arrival)), default=None)
             if due is None:
-                if place.task.period or self.index - place.last < LONGEST_SILENCE:
+                if slot.task.period or self.index - slot.last < MAX_STEPS_WITHOUT_FRAME:
                     continue
-                due = now + place.latency
-            place.last = self.index
-            place.coming.append(Batch(now, max(due, now + CONTROL_PERIOD_NS), place.inbox.copy()))
-            place.inbox.clear()
-            self._work(place)
+                due = now + slot.latency
+            slot.last = self.index
+            slot.pending.append(Batch(now, max(due, now + CONTROL_PERIOD_NS), slot.inbox.copy()))
+            slot.inbox.clear()
+            self._work(slot)
 
-    def _work(self, place: Place) -> None:
+    def _work(self, slot: Slot) -> None:
         """Collect results and begin batches in order, as far as possible."""
-        coming, participant = place.coming, place.participant
-        assert participant is not None  # an empty place has no batches
-        while coming:
-            batch = coming[0]
+        pending, participant = slot.pending, slot.participant
+        assert participant is not None  # an empty slot has no batches
+        while pending:
+            batch = pending[0]
             if not batch.begun:
-                if place.takes_images:
-                    if first_undrawn(batch) is not None:
+                if slot.takes_images:
+                    if first_pending_image(batch) is not None:
                         return
                     lost = [packet for packet in batch.packets if is_lost(packet)]
-                    if lost:  # nothing comes of it; the rest of the batch goes with the next
-                        coming.popleft()
-                        after = coming[0].packets if coming else place.inbox
+                    if lost:  # there will be no result; the rest of the batch is merged with the next one
+                        pending.popleft()
+                        after = pending[0].packets if pending else slot.inbox
                         after[:0] = [packet for packet in batch.packets if packet not in lost]
                         continue
                 batch.begun = True
@@ -301,23 +301,23 @@ class Schedule:
             if results is None:
                 return
             batch.results = results
-            place.done.append(coming.popleft())
+            slot.done.append(pending.popleft())
 
     # -- images ------------------------------------------------------------------------------------------------------
 
     def _note_images(self, arrivals: Sequence[Arrival]) -> None:
         for arrival in arrivals:
             if arrival.image is not None and arrival.image.ready is not None:
-                self._undrawn.setdefault(arrival.camera, deque()).append(arrival.image)
+                self._pending_images.setdefault(arrival.camera, deque()).append(arrival.image)
 
-    def _crowded(self) -> bool:
+    def _rendering_behind(self) -> bool:
         """Return whether frames arrive faster than they are rendered: then the flight waits, even if no participant does."""
-        crowded = False
-        for images in self._undrawn.values():
-            while images and is_drawn(images[0]):
+        behind = False
+        for images in self._pending_images.values():
+            while images and is_rendered(images[0]):
                 images.popleft()
-            crowded = crowded or len(images) > MOST_UNDRAWN
-        return crowded
+            behind = behind or len(images) > MAX_PENDING_IMAGES
+        return behind
 
 
 def _is_latched(channel: str) -> bool:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from perch_sim.scenario import Latency
 
 START = 1_000_000_000  # stamp at which a flight begins: ROS reads zero as "no time yet" [ns]
-BEGUN = START + 100_000_000  # a flight that waits for its goal has not gone on for so long
+START_DEADLINE = START + 100_000_000  # until then a flight may wait for its first goal [ns]
 DECISION_STEPS = 10   # the mission decides at 50 Hz
 RECORDING_STEPS = 50  # the recorder writes every 0.1 s of flight within 0.1 s, so that the flight cannot outrun the disk
 RECORDING_TIME = 0.1  # [s]

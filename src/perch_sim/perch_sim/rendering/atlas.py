@@ -70,7 +70,7 @@ def build_atlas(scene: Scene) -> Atlas:
     affine = np.zeros((len(faces), count.max(), 4), np.float32)
     tiles.append((-1, 0, np.full((8, 8), VOID, np.uint8)))
     places, shape = _pack([tile.shape for _, _, tile in tiles])
-    image = np.zeros(shape, np.uint8)  # between the tiles there are pages that nobody touches
+    image = np.zeros(shape, np.uint8)  # pages between the tiles are never touched
     void = (0.0, 0.0)
     for (number, level, tile), (x, y) in zip(tiles, places):
         rows, cols = tile.shape

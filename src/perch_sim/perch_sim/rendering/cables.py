@@ -86,12 +86,12 @@ class CablePainter:
         low, high = np.minimum(pixels[a], pixels[b]), np.maximum(pixels[a], pixels[b])
         with np.errstate(invalid="ignore"):
             near = np.all((high > -reach[:, None]) & (low < size + reach[:, None]), axis=1)
-        seen = np.flatnonzero(valid[a] & valid[b] & np.isfinite(scale) & near)
-        if not len(seen):
+        visible = np.flatnonzero(valid[a] & valid[b] & np.isfinite(scale) & near)
+        if not len(visible):
             return None
-        a, b, direction = a[seen], b[seen], direction[seen]
-        return _Pieces(np.stack([pixels[a], pixels[b]], axis=1), points_C[a], direction, length[seen],
-                       np.cross(points_C[a], direction), scale[seen], a == 0, b == len(points_C) - 1)
+        a, b, direction = a[visible], b[visible], direction[visible]
+        return _Pieces(np.stack([pixels[a], pixels[b]], axis=1), points_C[a], direction, length[visible],
+                       np.cross(points_C[a], direction), scale[visible], a == 0, b == len(points_C) - 1)
 
     def _scale(self, points_C: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the pixels per metre across a wire, shape (n,): area scale of the image over its length scale along the wire."""
@@ -112,17 +112,17 @@ class CablePainter:
         offset = _dot(rays, pieces.moment[piece]) / np.sqrt(sine2)
         width, centre = cable.radius * pieces.scale[piece], offset * pieces.scale[piece]
         share = np.minimum(np.minimum(width, centre + 0.5) - np.maximum(-width, centre - 0.5), 1.0)
-        wet = np.flatnonzero(share > 0.004)
-        rays, cosine, piece = rays[wet], cosine[wet], piece[wet]
+        covered = np.flatnonzero(share > 0.004)
+        rays, cosine, piece = rays[covered], cosine[covered], piece[covered]
         toward = _dot(rays, pieces.start_C[piece])
         # the axis' nearest point: so far from the piece's start, and so far along the ray [m]
-        along = (cosine * toward - _dot(pieces.direction, pieces.start_C)[piece]) / sine2[wet]
+        along = (cosine * toward - _dot(pieces.direction, pieces.start_C)[piece]) / sine2[covered]
         distance = toward + along * cosine
         shown = distance > 0
         shown &= ~(pieces.first[piece] & (along < 0)) & ~(pieces.last[piece] & (along > pieces.length[piece]))
         shown &= ~_hidden(rays, distance, faces, half)
-        wet = wet[shown]
-        self._blend(image, pixels[wet], share[wet], _shade(offset[wet] / cable.radius, width[wet]),
+        covered = covered[shown]
+        self._blend(image, pixels[covered], share[covered], _shade(offset[covered] / cable.radius, width[covered]),
                     np.array(cable.colour, dtype=float))
 
     def _band(self, pieces: _Pieces, radius: float) -> tuple[np.ndarray, np.ndarray]:

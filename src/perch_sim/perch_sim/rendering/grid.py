@@ -76,8 +76,8 @@ def build_grid(camera: Camera) -> CellGrid:
     rows, cols = -(-camera.height // CELL), -(-camera.width // CELL)
     u, v = np.meshgrid(np.arange(cols + 1) * CELL - 0.5, np.arange(rows + 1) * CELL - 0.5)
     rays = camera.unproject(np.stack([u, v], axis=-1))
-    seen = np.asarray(np.isfinite(rays).all(axis=-1))
-    rays = np.where(seen[..., None], rays, 0.0)
+    valid = np.asarray(np.isfinite(rays).all(axis=-1))
+    rays = np.where(valid[..., None], rays, 0.0)
     index = np.arange((rows + 1) * (cols + 1)).reshape(rows + 1, cols + 1)
     corner_nodes = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], axis=-1).reshape(-1, 4)
     nodes = rays.reshape(-1, 3)
@@ -91,6 +91,6 @@ def build_grid(camera: Camera) -> CellGrid:
     return CellGrid(
         rows, cols, np.ascontiguousarray(nodes.T, np.float32), corner_nodes,
         np.ascontiguousarray(corners.transpose(0, 2, 1), np.float32), centres.astype(np.float32),
-        np.asarray(~seen.reshape(-1)[corner_nodes].all(axis=1)),
+        np.asarray(~valid.reshape(-1)[corner_nodes].all(axis=1)),
         (np.sqrt(np.maximum(solid_angle, 1e-12)) / CELL).astype(np.float32),
     )

@@ -13,7 +13,7 @@ from perch_core.camera import Camera, Region
 from perch_sim.rendering.atlas import LEVELS_PER_OCTAVE, Atlas
 from perch_sim.rendering.grid import CELL, CellGrid, sample_weights
 from perch_sim.rendering.kernels import affine_of_cells, faces_behind, nearer_samples, place_texels, texels_per_pixel, uniform_samples
-from perch_sim.rendering.visibility import FaceArrays, View, look
+from perch_sim.rendering.visibility import FaceArrays, View, classify_view
 
 MIXED_SUPERSAMPLING = 2  # where faces meet, in each direction
 PAD_SUPERSAMPLING = 4  # of the tags, in each direction
@@ -36,26 +36,26 @@ class Rasterizer:
             region: rows and columns to draw.
         """
         grid, faces = self.grid, self.faces
-        view = look(faces, grid, self.camera, p_WC, R_WC, shift_W)
+        view = classify_view(faces, grid, self.camera, p_WC, R_WC, shift_W)
         first, uniform = view.first, view.uniform
         fine_face = np.zeros(len(faces.fine) + 1, dtype=bool)
         fine_face[:-1] = faces.fine  # the last entry answers for the winner -1
-        lit = ~grid.blind & (first >= 0)
+        visible = ~grid.blind & (first >= 0)
         fine = uniform & fine_face[first]
         mixed = ~uniform & ~grid.blind
         tagged = mixed & view.shown[faces.fine[faces.bounded]].any(axis=0)
-        supersampling = self._fine_supersampling(view, np.flatnonzero((fine & lit) | tagged))
-        asked = grid.cells_in(region)
+        supersampling = self._fine_supersampling(view, np.flatnonzero((fine & visible) | tagged))
+        requested = grid.cells_in(region)
         image = np.empty((grid.rows, CELL, grid.cols, CELL), np.uint8)
-        self._draw_uniform(image, view, np.flatnonzero(uniform & lit & ~fine & asked), first, 1)
-        self._draw_uniform(image, view, np.flatnonzero(fine & lit & asked), first, supersampling)
-        self._draw_mixed(image, view, np.flatnonzero(mixed & ~tagged & asked), MIXED_SUPERSAMPLING)
-        self._draw_mixed(image, view, np.flatnonzero(tagged & asked), max(supersampling, MIXED_SUPERSAMPLING))
-        self._leave_empty(image, np.flatnonzero(uniform & ~lit & asked), self._void)
-        self._leave_empty(image, np.flatnonzero(grid.blind & asked), 0)
+        self._draw_uniform(image, view, np.flatnonzero(uniform & visible & ~fine & requested), first, 1)
+        self._draw_uniform(image, view, np.flatnonzero(fine & visible & requested), first, supersampling)
+        self._draw_mixed(image, view, np.flatnonzero(mixed & ~tagged & requested), MIXED_SUPERSAMPLING)
+        self._draw_mixed(image, view, np.flatnonzero(tagged & requested), max(supersampling, MIXED_SUPERSAMPLING))
+        self._fill(image, np.flatnonzero(uniform & ~visible & requested), self._void)
+        self._fill(image, np.flatnonzero(grid.blind & requested), 0)
         return image.reshape(grid.rows * CELL, grid.cols * CELL)[: self.camera.height, : self.camera.width]
 
-    def _leave_empty(self, image: np.ndarray, cells: np.ndarray, level: int) -> None:
+    def _fill(self, image: np.ndarray, cells: np.ndarray, level: int) -> None:
         if len(cells):
             row, col = np.divmod(cells, self.grid.cols)
             image[row, :, col, :] = level
@@ -112,6 +112,6 @@ class Rasterizer:
     def _look_up(self, image: np.ndarray, cells: np.ndarray, x: np.ndarray, y: np.ndarray,
                  supersampling: int) -> None:
         """Write the texels at x, y (cells, samples), averaged per pixel, to the image's cells."""
-        # remap wants sides below 32768, which whole cells in rows keep
+        # remap requires sides below 32768, which whole cells in rows keep
         texels = cv2.remap(self.atlas.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         place_texels(texels, cells, supersampling**2, image)

@@ -73,12 +73,12 @@ class Renderer:
         shift_W = np.asarray(target_shift, dtype=float)
         poses = [(np.asarray(p, dtype=float), np.asarray(R, dtype=float)) for p, R in poses]
         region = region or self._whole
-        lit = self._sensor.lit(region)
-        frames = [self._light(*self.mount.pose(p, R), shift_W, lit) for p, R in spread(poses, self._subframes(poses))]
+        blurred = self._sensor.blur_region(region)
+        frames = [self._light(*self.mount.pose(p, R), shift_W, blurred) for p, R in spread(poses, self._subframes(poses))]
         light = frames[0]
         if len(frames) > 1:
-            mean = sum(frame[lit].astype(np.uint16) for frame in frames)
-            light[lit] = (mean + len(frames) // 2) // len(frames)
+            mean = sum(frame[blurred].astype(np.uint16) for frame in frames)
+            light[blurred] = (mean + len(frames) // 2) // len(frames)
         return self._sensor.expose(light, rng, region)
 
     def _light(self, p_WC: np.ndarray, R_WC: np.ndarray, shift_W: np.ndarray, region: Region | None = None) -> np.ndarray:

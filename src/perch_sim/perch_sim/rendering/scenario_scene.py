@@ -37,6 +37,6 @@ def build_scene(scenario: Scenario, seed: int = 0) -> Scene:
 
 
 def _curve(cable: Cable) -> CableCurve:
-    hanging = cable.hanging()
-    count = max(2, int(np.ceil(hanging.length / CABLE_SPACING)) + 1)
-    return CableCurve(hanging.sample(count), cable.radius, CABLE_COLOURS[cable.colour])
+    catenary = cable.catenary()
+    count = max(2, int(np.ceil(catenary.length / CABLE_SPACING)) + 1)
+    return CableCurve(catenary.sample(count), cable.radius, CABLE_COLOURS[cable.colour])

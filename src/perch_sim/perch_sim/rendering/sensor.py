@@ -63,7 +63,7 @@ class Sensor:
         self._sigma = np.sqrt(variance).astype(np.float32)
         self._size = (camera.height, camera.width)
 
-    def lit(self, region: Region) -> Region:
+    def blur_region(self, region: Region) -> Region:
         """Return a region widened by the reach of the blur."""
         rows, cols = (slice(max(part.start - BLUR_REACH, 0), min(part.stop + BLUR_REACH, size)) for part, size in zip(region, self._size))
         return rows, cols
@@ -72,12 +72,12 @@ class Sensor:
         """Return the noisy image of the light on the sensor, uint8, black outside the region.
 
         Args:
-            light: uint8, shape (height, width) or (height, width, 3), before the optics; must be valid within `lit(region)`.
+            light: uint8, shape (height, width) or (height, width, 3), before the optics; must be valid within `blur_region(region)`.
             rng: random generator of this frame's noise.
             region: rows and columns that are read out; None: all.
         """
         region = region or (slice(0, self._size[0]), slice(0, self._size[1]))
-        around = self.lit(region)
+        around = self.blur_region(region)
         inner = tuple(slice(part.start - wide.start, part.stop - wide.start) for part, wide in zip(region, around))
         image = cv2.GaussianBlur(light[around], (5, 5), PSF_SIGMA, borderType=cv2.BORDER_REPLICATE)[inner]
         image = cv2.multiply(image, self._vignette[region], dtype=cv2.CV_8U)

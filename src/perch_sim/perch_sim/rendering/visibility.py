@@ -17,7 +17,7 @@ from perch_sim.rendering.kernels import classify
 from perch_sim.rendering.scene import Face
 
 EDGE_SAMPLES = 128  # points per edge by which the cells are found that an edge crosses
-NEAREST = 1e-3  # a camera closer to a face's plane than this sees nothing of it [m]
+MIN_DISTANCE = 1e-3  # a camera closer to a face's plane than this sees nothing of it [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ def face_matrices(faces: FaceArrays, p_WC: np.ndarray, R_WC: np.ndarray,
     """Return M (n, 3, 3), distances (n,) [m] and the mask of faces turned towards the camera: see `View`."""
     offset = p_WC - faces.centre_W - faces.moving[:, None] * shift_W  # from the face's centre to the camera
     distance = np.sum(faces.normal_W * offset, axis=1)
-    front = distance > NEAREST
+    front = distance > MIN_DISTANCE
     inverse = -(faces.normal_W @ R_WC) / np.where(front, distance, 1.0)[:, None]
     M = np.empty((len(distance), 3, 3))
     M[:, 0] = np.sum(faces.right_W * offset, axis=1)[:, None] * inverse + faces.right_W @ R_WC
@@ -108,7 +108,7 @@ def face_matrices(faces: FaceArrays, p_WC: np.ndarray, R_WC: np.ndarray,
     return M.astype(np.float32), distance, front
 
 
-def look(faces: FaceArrays, grid: CellGrid, camera: Camera, p_WC: np.ndarray, R_WC: np.ndarray,
+def classify_view(faces: FaceArrays, grid: CellGrid, camera: Camera, p_WC: np.ndarray, R_WC: np.ndarray,
          shift_W: np.ndarray) -> View:
     """Return the face that each cell shows, and the cells that edges of faces cross.
 

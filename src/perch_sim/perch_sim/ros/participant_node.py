@@ -24,15 +24,15 @@ from perch_core.ros.priority import priority
 from perch_core.ros.wiring import Wiring
 from perch_core.values import Serialized
 from perch_sim.lockstep import Answer, LocalParticipant, Packet, is_slow
-from perch_sim.lockstep.link import Waiting, address, knock, pack, unpack
+from perch_sim.lockstep.link import ConnectionPoll, address, connect_to_vehicle, pack, unpack
 from rclpy.clock import Clock, ClockType
 
-KNOCK = 0.1     # between looks for the vehicle [s]
-LOOK = 0.005    # between looks whether what a batch waits for has come [s]
-PATIENCE = 0.01  # with which a batch is waited for before other events are looked at [s]
-ANSWERED = 65.0  # an answer that has not come for so long was lost with its server: no planner is given more than 60 s [s]
-BURST = 40      # batches between which other events are looked at
-OBSERVED = ("/diagnostics", "/tf", "/tf_static", "robot_description")  # taken as they come by who only keeps messages
+CONNECT_PERIOD = 0.1   # between attempts to connect to the vehicle [s]
+CHECK_PERIOD = 0.005   # between checks whether an unfinished batch can continue [s]
+POLL_TIMEOUT = 0.01    # wait for a batch before other events are processed [s]
+ANSWER_TIMEOUT = 65.0  # an answer this late was lost with its server: no planner is given more than 60 s [s]
+BURST = 40             # batches between which other events are processed
+OBSERVED = ("/diagnostics", "/tf", "/tf_static", "robot_description")  # taken on arrival by components that only store messages
 
 
 class ParticipantNode(ComponentNode):
@@ -44,91 +44,92 @@ class ParticipantNode(ComponentNode):
             name, component, wiring, kwargs: as in `ComponentNode`.
         """
         super().__init__(name, component, wiring, **kwargs)
-        hold = self.declare_parameter("lockstep_hold", "").value
+        await_goal = self.declare_parameter("lockstep_hold", "").value
         self.declare_parameter("lockstep", True)
-        self.participant = LocalParticipant(self.component, codec=topics, ask=self._ask, hold=hold, name=name)
+        self.participant = LocalParticipant(self.component, codec=topics, send_request=self._send_request,
+                                            await_goal=await_goal, name=name)
         self.participant.begin = partial(self.guarded, "step", self.participant.begin)  # type: ignore[method-assign]
         self.participant.results = partial(self._results, self.participant.results)  # type: ignore[method-assign]
         self._observed = [port for port in ports(component, Input) if port.channel(self.component) in OBSERVED and port.value is Serialized]
         self.participant.inputs -= {port.channel(self.component) for port in self._observed}
         self._intake = Intake(self)
-        self._asking: dict[str, Callable[[Any, int], None]] = {}
-        self._open: defaultdict[str, deque[tuple[Answer, float]]] = defaultdict(deque)
+        self._request_senders: dict[str, Callable[[Any, int], None]] = {}
+        self._open_requests: defaultdict[str, deque[tuple[Answer, float]]] = defaultdict(deque)
         """Channel -> unanswered requests, each with its time on the monotonic clock [s]; a server answers them in order."""
-        self._busy = False  # with a batch
-        self._vehicle: Any = None  # the connection to it, where there is one
-        self._waiting = Waiting()
+        self._busy = False  # processing a batch
+        self._vehicle: Any = None  # the connection to it, if any
+        self._connection_poll = ConnectionPoll()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         wiring.participants[name] = self.participant
 
     def connect(self) -> None:
         """Offer services and connect clients; if the vehicle is in another process, connect to it."""
-        asks = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
+        senders = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
         connect_clients(self, self.component, self._deliver_answer)
-        self._asking = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
-        for port in self._client_ports():  # the participant's own, which keep the time of answers
-            setattr(self.component, port.name, asks[port.channel(self.component)])
+        self._request_senders = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
+        for port in self._client_ports():  # those of the participant, which deliver answers when they are due
+            setattr(self.component, port.name, senders[port.channel(self.component)])
         self.serve()
         for observed in self._observed:
             self._intake.add(observed)
-        if self._asking:
-            self.create_timer(1.0, self._give_up, clock=self._steady)
+        if self._request_senders:
+            self.create_timer(1.0, self._expire_requests, clock=self._steady)
         if self.wiring.hosts_schedule:
             return
         if is_slow(self.get_name()):
-            priority.lower_priority()  # a step goes before work that has time
+            priority.lower_priority()  # steps take priority over slow work
         self._where = address(os.environ.get("ROS_DOMAIN_ID", "0"), self.get_namespace())
-        self._look = self.create_timer(LOOK, self._go_on, clock=self._steady)
-        self._look.cancel()
-        self.create_timer(KNOCK, self._knock, clock=self._steady)
-        self._knock()
+        self._check_timer = self.create_timer(CHECK_PERIOD, self._finish_batch, clock=self._steady)
+        self._check_timer.cancel()
+        self.create_timer(CONNECT_PERIOD, self._try_connect, clock=self._steady)
+        self._try_connect()
 
     # -- batches from another process --------------------------------------------------------------------------------
 
-    def _knock(self) -> None:
+    def _try_connect(self) -> None:
         """Try to connect to the vehicle, unless connected."""
         if self._vehicle is None:
-            self._vehicle = knock(self._where, self.get_name(), self.participant.inputs)
+            self._vehicle = connect_to_vehicle(self._where, self.get_name(), self.participant.inputs)
             if self._vehicle is not None:
-                self._waiting.add(self._vehicle)
-                self.wiring.from_thread(self._work_on)
+                self._connection_poll.add(self._vehicle)
+                self.wiring.from_thread(self._process_batches)
 
-    def _work_on(self) -> None:
+    def _process_batches(self) -> None:
         """Process up to `BURST` batches, then let the executor process other events first."""
         for _ in range(BURST):
-            if not self._waiting.ready(PATIENCE):
+            if not self._connection_poll.ready(POLL_TIMEOUT):
                 break
             try:
                 stamp, batch = unpack(self._vehicle.recv_bytes(), topics)
             except (OSError, EOFError, PerchError):
-                self._leave()
+                self._disconnect()
                 return
             self._busy = True
             self.participant.begin(stamp, batch)
-            self._go_on()
+            self._finish_batch()
             if self._busy or self._vehicle is None:
                 return
-        self.wiring.from_thread(self._work_on)
+        self.wiring.from_thread(self._process_batches)
 
-    def _go_on(self) -> None:
+    def _finish_batch(self) -> None:
         """Send the results of a finished batch; check an unfinished one again later."""
         if not self._busy:
             return
         packets = self.participant.results()
         if packets is None:
-            if self._look.is_canceled():
-                self._look.reset()
+            if self._check_timer.is_canceled():
+                self._check_timer.reset()
             return
         self._busy = False
-        waited = not self._look.is_canceled()
-        self._look.cancel()
+        waited = not self._check_timer.is_canceled()
+        self._check_timer.cancel()
         try:
             self._vehicle.send_bytes(pack(0, packets))
         except OSError:
-            self._leave()
+            self._disconnect()
             return
         if waited:
-            self.wiring.from_thread(self._work_on)
+            self.wiring.from_thread(self._process_batches)
 
     def _results(self, results: Callable[[], list[Packet] | None]) -> list[Packet] | None:
         """Return the participant's results; an exception is logged, its packet is dropped, and the batch continues."""
@@ -138,10 +139,10 @@ class ParticipantNode(ComponentNode):
             except Exception as error:
                 self.log_refusal("step", error)
 
-    def _leave(self) -> None:
+    def _disconnect(self) -> None:
         """Close the connection to a vehicle that has ended; another one may be found later."""
         self._busy = False
-        self._waiting.remove(self._vehicle)
+        self._connection_poll.remove(self._vehicle)
         self._vehicle = None
 
     # -- requests ----------------------------------------------------------------------------------------------------
@@ -154,25 +155,25 @@ class ParticipantNode(ComponentNode):
     def _client_ports(self) -> list[Client]:
         return list(ports(type(self.component), Client))
 
-    def _ask(self, channel: str, request: Any) -> Answer:
+    def _send_request(self, channel: str, request: Any) -> Answer:
         """Send a component's request to its service; the participant delivers the answer when it is due."""
         answer = Answer()
-        self._open[channel].append((answer, time.monotonic()))
-        self._asking[channel](request, 0)
+        self._open_requests[channel].append((answer, time.monotonic()))
+        self._request_senders[channel](request, 0)
         return answer
 
     def _deliver_answer(self, port: Client, value: Any) -> None:
-        waiting = self._open[port.channel(self.component)]
+        waiting = self._open_requests[port.channel(self.component)]
         if waiting:
             waiting.popleft()[0](value)
         self._progress()
 
-    def _give_up(self) -> None:
+    def _expire_requests(self) -> None:
         """Answer overdue requests with `Unavailable`: their servers may have ended, and the flight must not wait for ever."""
-        for channel, waiting in tuple(self._open.items()):
-            if waiting and time.monotonic() - waiting[0][1] > ANSWERED:
-                self.get_logger().error(f"{channel} has not answered for {ANSWERED:g} s: its answer is given up")
-                waiting.popleft()[0](Unavailable(f"{channel} has not answered within {ANSWERED:g} s"))
+        for channel, waiting in tuple(self._open_requests.items()):
+            if waiting and time.monotonic() - waiting[0][1] > ANSWER_TIMEOUT:
+                self.get_logger().error(f"{channel} has not answered for {ANSWER_TIMEOUT:g} s: the request is dropped")
+                waiting.popleft()[0](Unavailable(f"{channel} has not answered within {ANSWER_TIMEOUT:g} s"))
                 self._progress()
 
     def _progress(self) -> None:
@@ -180,4 +181,4 @@ class ParticipantNode(ComponentNode):
         if self.wiring.hosts_schedule:
             self.wiring.progress()
         else:
-            self._go_on()
+            self._finish_batch()

@@ -13,28 +13,28 @@ from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import SHARED_TOPICS
 from perch_core.ros.wiring import Publication, Wiring, foreign_publishers
 from perch_core.values import CameraImage
-from perch_sim.lockstep import BEGUN, Schedule, flight_tasks
-from perch_sim.lockstep.link import Door, Waiting, address
+from perch_sim.lockstep import START_DEADLINE, Schedule, flight_tasks
+from perch_sim.lockstep.link import ConnectionPoll, ParticipantListener, address
 from perch_sim.pacing import Pacing
 from perch_sim.ros.remote import RemoteParticipant
 from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
 from rclpy.clock import Clock, ClockType
 
-LOOK = 0.05         # between looks at who is silent [s]
-STRANGERS = 1.0     # between looks for writers that do not count [s]
-NAMED = 3.0         # a wait is named after so long [s] ...
-NAG = 10.0          # ... and again this often [s]
-PATIENCE = 0.005    # with which results are waited for before other events are looked at [s]
-BURST = 40          # steps between which other events are looked at
-DRAWING_WAIT = 0.02  # for an image without which nobody can go on, at a time [s]
-START_PATIENCE = 60.0  # for participants to come, where a silent one is not given more [s]
-SETTLED_LOOKS = 3   # everybody has to be there this often in a row before the first step
+CHECK_PERIOD = 0.05         # between checks of the participants [s]
+FOREIGN_CHECK_PERIOD = 1.0  # between checks for foreign publishers [s]
+WARN_AFTER = 3.0            # a wait is reported after so long [s] ...
+WARN_REPEAT = 10.0          # ... and again at this interval [s]
+POLL_TIMEOUT = 0.005        # wait for results before other events are processed [s]
+BURST = 40                  # steps between which other events are processed
+IMAGE_TIMEOUT = 0.02        # one wait for an image without which the flight cannot continue [s]
+START_TIMEOUT = 60.0        # for participants to connect; longer if `lockstep_timeout` is [s]
+START_CHECKS = 3            # consecutive checks with all participants connected before the first step
 
 
 class VehicleNode(ComponentNode):
     """Node of `SimulatedVehicle` with its schedule."""
 
-    component: Any  # a `perch_sim.lockstep.schedule.Vehicle` that says whether it is ready, and diagnoses itself
+    component: Any  # a `perch_sim.lockstep.schedule.Vehicle` with `ready` and `diagnose`
 
     def __init__(self, name: str, component: type[Component], wiring: Wiring, **kwargs: Any) -> None:
         """
@@ -44,16 +44,16 @@ class VehicleNode(ComponentNode):
         super().__init__(name, component, wiring, **kwargs)
         self.declare_parameter("lockstep", True)
         self._expected = tuple(one for one in self.component.config.participants if one)
-        self._door = Door(address(os.environ.get("ROS_DOMAIN_ID", "0"), self.get_namespace()))
-        self._links = Waiting()
+        self._listener = ParticipantListener(address(os.environ.get("ROS_DOMAIN_ID", "0"), self.get_namespace()))
+        self._links = ConnectionPoll()
         self._schedule = Schedule(self.component, (), flight_tasks(self.component.scenario.latency), codec=topics)
         self._remote: dict[str, RemoteParticipant] = {}
-        self._started = self._again = False
-        self._looks = 0
-        self._begun = self._progress = self._named = time.monotonic()
+        self._started = self._advance_queued = False
+        self._complete_checks = 0
+        self._created_at = self._last_progress = self._last_warning = time.monotonic()
         self._dropped: set[str] = set()
-        self._gone: set[str] = set()  # whose connection has ended
-        self._undrawn: list[tuple[Callable[[CameraImage], None], CameraImage]] = []
+        self._disconnected: set[str] = set()  # whose connection has ended
+        self._pending_images: list[tuple[Callable[[CameraImage], None], CameraImage]] = []
         self._pacing: Pacing | None = None
         self._allowance = 0
         self._counted = (time.monotonic(), 0)
@@ -65,56 +65,56 @@ class VehicleNode(ComponentNode):
         for name, participant in self.wiring.participants.items():
             if name in self._expected:
                 self._schedule.join(participant)
-        self.create_timer(LOOK, self._look_after, clock=self._steady)
-        self.create_timer(STRANGERS, self._look_for_strangers, clock=self._steady)
+        self.create_timer(CHECK_PERIOD, self._supervise, clock=self._steady)
+        self.create_timer(FOREIGN_CHECK_PERIOD, self._warn_foreign_publishers, clock=self._steady)
         self.create_timer(1.0, self._diagnose, clock=self._steady)
 
     def _emit_function(self, topic: str, publication: Publication):
         """Return the function that emits a value; images are emitted when they have been rendered."""
-        usual = super()._emit_function(topic, publication)
+        publish_now = super()._emit_function(topic, publication)
 
         def publish(value: Any) -> None:
             if isinstance(value, CameraImage) and value.ready is not None:
                 if self.wiring.has_reader(topic) or publication.has_subscribers():
-                    self._undrawn.append((usual, value))
+                    self._pending_images.append((publish_now, value))
             else:
-                usual(value)
+                publish_now(value)
 
         return publish
 
     # -- participants ------------------------------------------------------------------------------------------------
 
-    def _let_in(self) -> None:
+    def _accept_participants(self) -> None:
         """Accept participants that connect; one that reconnects replaces its former connection."""
-        for name, inputs, connection in self._door.let_in():
+        for name, inputs, connection in self._listener.accept():
             if name not in self._expected:
-                self.warn_once(f"lockstep: {name!r} wants to take part but is not in the parameter participants: it is ignored")
+                self.warn_once(f"lockstep: {name!r} tried to connect but is not in the parameter participants: ignored")
                 connection.close()
                 continue
-            known = self._remote.get(name)
-            if known is not None:
-                self._links.remove(known.connection)
-                known.close()
+            former = self._remote.get(name)
+            if former is not None:
+                self._links.remove(former.connection)
+                former.close()
             one = self._remote[name] = RemoteParticipant(name, inputs, connection)
             self._links.add(connection)
             self._dropped.discard(name)
-            self._gone.discard(name)
+            self._disconnected.discard(name)
             if self._started:
                 self._schedule.join(one)
-                self.get_logger().warning(f"lockstep: {name} is back")
+                self.get_logger().warning(f"lockstep: {name} has reconnected")
 
     def _receive(self, timeout: float) -> bool:
         """Receive results that arrive within a time [s]; return whether there were any."""
         for one in self._remote.values():
-            one.go_on()
+            one.flush()
         connections = self._links.ready(timeout)
         for connection in connections:
             one = next(remote for remote in self._remote.values() if remote.connection is connection)
             one.receive()
-            if one.gone:
+            if one.closed:
                 self._links.remove(connection)
-                self._gone.add(one.name)
-                self.get_logger().error(f"lockstep: {one.name} is gone")
+                self._disconnected.add(one.name)
+                self.get_logger().error(f"lockstep: {one.name} has disconnected")
         return bool(connections)
 
     def _missing(self) -> list[str]:
@@ -122,39 +122,39 @@ class VehicleNode(ComponentNode):
         here = set(self._schedule.names) | set(self._remote) | self._dropped
         return [name for name in self._expected if name not in here]
 
-    # -- going on ----------------------------------------------------------------------------------------------------
+    # -- stepping ----------------------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
         """Advance the flight as far as the participants permit."""
-        if self._started and not self._again:
+        if self._started and not self._advance_queued:
             self.wiring.enter(self.guarded, "advance", self._burst)
 
     def _burst(self) -> None:
         """Advance up to `BURST` steps, then let the executor process other events first."""
         schedule = self._schedule
         for _ in range(BURST):
-            if not self._in_time():
+            if not self._step_due():
                 return
             if self._remote:
                 self._receive(0.0)
             if schedule.advance():
-                self._progress = time.monotonic()
-                if self._undrawn:
-                    self._publish_drawn()
-            elif not schedule.await_image(DRAWING_WAIT):
-                if not any(owed.name in self._remote for owed in schedule.owed()):
-                    return  # a neighbour waits for an answer or a goal, and says so when it has come
-                if not self._receive(PATIENCE):
+                self._last_progress = time.monotonic()
+                if self._pending_images:
+                    self._publish_rendered()
+            elif not schedule.await_image(IMAGE_TIMEOUT):
+                if not any(pending.name in self._remote for pending in schedule.pending()):
+                    return  # a participant of this process waits for an answer or a goal; `wiring.progress` continues
+                if not self._receive(POLL_TIMEOUT):
                     break
-        if not self._again:
-            self._again = True
+        if not self._advance_queued:
+            self._advance_queued = True
             self.wiring.from_thread(self._advance_again)
 
     def _advance_again(self) -> None:
-        self._again = False
+        self._advance_queued = False
         self.guarded("advance", self._burst)
 
-    def _in_time(self) -> bool:
+    def _step_due(self) -> bool:
         """Return whether the next step is due: a flight without controller is paced by the wall clock."""
         if "controller" in self._schedule.names:
             self._pacing = None
@@ -168,89 +168,89 @@ class VehicleNode(ComponentNode):
         self._allowance -= 1
         return True
 
-    def _publish_drawn(self) -> None:
-        waiting = []
-        for publish, image in self._undrawn:
+    def _publish_rendered(self) -> None:
+        pending = []
+        for publish, image in self._pending_images:
             if image.ready is not None and not image.ready(0.0):
-                waiting.append((publish, image))
+                pending.append((publish, image))
             elif image.pixels() is not None:
                 publish(image)
-        self._undrawn = waiting
+        self._pending_images = pending
 
-    # -- the silent --------------------------------------------------------------------------------------------------
+    # -- supervision -------------------------------------------------------------------------------------------------
 
-    def _look_after(self) -> None:
+    def _supervise(self) -> None:
         """Start the flight when all participants have connected; report and drop silent participants."""
         now = time.monotonic()
-        self._let_in()
+        self._accept_participants()
         if not self._started:
-            self._receive(0.0)  # who ends before the start
-            self._look_for_all(now)
+            self._receive(0.0)  # participants that end before the start
+            self._check_start(now)
         else:
-            self._look_for_silent(now)
+            self._check_silence(now)
         self._advance()
 
-    def _waiting(self) -> str:
-        """Describe what the flight waits for: participants, and what each owes."""
+    def _describe_wait(self) -> str:
+        """Describe what the flight waits for: participants, and the missing input of each."""
         if not self._started:
             missing = self._missing()
             if missing:
-                return f"{', '.join(missing)} to come"
-            return "the first images to be drawn"
-        return "; ".join(f"{owed.name}: {owed.what} (since {owed.since * 1e-9:.3f} s)" for owed in self._schedule.owed())
+                return f"{', '.join(missing)} to connect"
+            return "the first images to be rendered"
+        return "; ".join(f"{pending.name}: {pending.what} (since {pending.since * 1e-9:.3f} s)" for pending in self._schedule.pending())
 
-    def _look_for_all(self, now: float) -> None:
+    def _check_start(self, now: float) -> None:
         missing = self._missing()
         complete = not missing and self.component.ready()
-        self._looks = self._looks + 1 if complete else 0
-        if self._looks >= SETTLED_LOOKS:
+        self._complete_checks = self._complete_checks + 1 if complete else 0
+        if self._complete_checks >= START_CHECKS:
             for one in self._remote.values():
                 self._schedule.join(one)
-            self._started, self._progress = True, now
+            self._started, self._last_progress = True, now
             self.get_logger().info(f"lockstep: starting with {', '.join(self._schedule.names) or 'no participants'}")
-        elif missing and now - self._begun > (patience := max(START_PATIENCE, self.component.config.lockstep_timeout)):
+        elif missing and now - self._created_at > (timeout := max(START_TIMEOUT, self.component.config.lockstep_timeout)):
             for name in missing:
                 self._dropped.add(name)
-                self.get_logger().error(f"lockstep: {name} has not come within {patience:g} s: dropped")
+                self.get_logger().error(f"lockstep: {name} has not connected within {timeout:g} s: dropped")
 
-    def _look_for_silent(self, now: float) -> None:
-        silence = now - self._progress
-        if silence < NAMED:
+    def _check_silence(self, now: float) -> None:
+        silence = now - self._last_progress
+        if silence < WARN_AFTER:
             return
-        owed = self._schedule.owed()
-        if owed and (self._named < self._progress or now - self._named > NAG):
-            self._named = now
-            self.get_logger().warning(f"lockstep: for {silence:.0f} s waiting for {self._waiting()}")
-        for name in [one.name for one in owed if one.name in self._remote]:
-            if name not in self._gone and self._schedule.now < BEGUN:
-                continue  # it may wait for a goal, and planners that are to serve it may still compile
-            if silence > self.component.config.lockstep_timeout:  # one that has ended may be started again meanwhile
-                self._drop(name, "gone" if name in self._gone else f"silent for {silence:.0f} s")
-                self._progress = now
+        pending = self._schedule.pending()
+        if pending and (self._last_warning < self._last_progress or now - self._last_warning > WARN_REPEAT):
+            self._last_warning = now
+            self.get_logger().warning(f"lockstep: for {silence:.0f} s waiting for {self._describe_wait()}")
+        for name in [one.name for one in pending if one.name in self._remote]:
+            if name not in self._disconnected and self._schedule.now < START_DEADLINE:
+                continue  # it may wait for a goal, and its planners may still compile
+            if silence > self.component.config.lockstep_timeout:  # a node that has ended may be restarted meanwhile
+                self._drop(name, "disconnected" if name in self._disconnected else f"silent for {silence:.0f} s")
+                self._last_progress = now
 
     def _drop(self, name: str, why: str) -> None:
-        self.get_logger().error(f"lockstep: {name} is {why}: dropped, the flight goes on without it")
+        self.get_logger().error(f"lockstep: {name} is {why}: dropped, the flight continues without it")
         self._dropped.add(name)
         self._schedule.drop(name)
-        one = self._remote.pop(name)  # once it goes on, it finds its connection closed and comes again
+        one = self._remote.pop(name)  # if it continues, it finds its connection closed and reconnects
         self._links.remove(one.connection)
         one.close()
 
-    def _look_for_strangers(self) -> None:
+    def _warn_foreign_publishers(self) -> None:
         """Warn of nodes that publish on topics of the flight without taking part; their messages are ignored."""
         inputs = set().union(*(one.inputs for one in (*self._remote.values(), *self.wiring.participants.values())))
         inputs = (inputs - set(SHARED_TOPICS)) | {"motor_command"}
-        known = {f"{self.get_namespace().rstrip('/')}/{name}" for name in (*self._expected, self.get_name())}
+        members = {f"{self.get_namespace().rstrip('/')}/{name}" for name in (*self._expected, self.get_name())}
         for channel in sorted(inputs):
-            for stranger in foreign_publishers(self, self.resolve_topic_name(channel), known):
-                self.warn_once(f"{channel}: {stranger} publishes it but takes no part in the lockstep: it is ignored")
+            for publisher in foreign_publishers(self, self.resolve_topic_name(channel), members):
+                self.warn_once(f"{channel}: {publisher} publishes it but is not a participant of the lockstep: ignored")
 
     def close(self) -> None:
         """Stop accepting participants, and release the node's resources."""
-        self._door.close()
+        self._listener.close()
         super().close()
 
-    # -- people ------------------------------------------------------------------------------------------------------
+    # -- diagnostics -------------------------------------------------------------------------------------------------
 
     def host_diagnostics(self) -> dict[str, Any]:
         """Return the speed of simulation time, and what the flight waits for."""
@@ -258,7 +258,7 @@ class VehicleNode(ComponentNode):
         since, before = self._counted
         self._counted = (now, steps)
         rate = (steps - before) / max(now - since, 1e-9)
-        return {"steps_per_s": rate, "real_time_factor": rate * CONTROL_PERIOD, "waiting_for": self._waiting()}
+        return {"steps_per_s": rate, "real_time_factor": rate * CONTROL_PERIOD, "waiting_for": self._describe_wait()}
 
     def _diagnose(self) -> None:
         """Emit diagnostics; called each second of wall-clock time, as simulation time may stand still."""
