@@ -88,7 +88,7 @@ def test_a_report_is_written(recorded, reported):
     folder, written = reported
     assert json.loads((folder / "report.json").read_text())["flight_hash"] == written["flight_hash"] == recorded[1].digest(4.0)
     page = (folder / "report.html").read_text()
-    for words in ("mission commands arm: take-off", "trajectory 1 (perch) starts, 2.00 s", "attached to pad",
+    for words in ("mission commands arm: take-off", "trajectory 1 (perch) starts, takes 2.00 s", "attached to pad",
                   "front camera, 1.00 to 3.80 s", "data:image/webp"):
         assert words in page
     for row in (f"<th>date</th><td>{written['date']}</td>", f"<th>commit</th><td>{written['commit']} (digest {written['digest']})</td>",
@@ -98,6 +98,14 @@ def test_a_report_is_written(recorded, reported):
     assert abs(datetime.now(UTC) - reported_at) < timedelta(hours=1)
     assert written["real_time_factor"] == pytest.approx(1.5)
     assert "1.50: 3.00 s of simulated time in 2.00 s" in page
+
+
+def test_a_replanned_trajectory_is_distinct_from_one_that_starts():
+    again = replace(PATH, start_time=PATH.start_time + 0.5)
+    orders = [TrajectoryOrder(5, path, AtEnd.RECOVER, 0.25, 1.2) for path in (PATH, again)]
+    assert [text for _, text in report._timeline(Flight({"trajectory": timed(orders)}))] == [
+        f"trajectory 5 (powerline perch with recovery) {verb} {PATH.duration:.2f} s, of which {PATH.duration - 1.2:.2f} s are recovery"
+        for verb in ("starts, takes", "is re-planned, what remains takes")]
 
 
 def test_the_clip_shows_what_the_cameras_saw_around_the_perch_at_the_speed_of_the_flight(recorded):
