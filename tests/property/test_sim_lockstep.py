@@ -414,7 +414,7 @@ def test_a_first_batch_waits_for_the_goal_that_holds_it_and_goals_go_in_front_of
     early = LocalParticipant(Asking(Nothing()), await_goal="perch")
     early.goal("perch", 2)
     assert said(early, 0) == ["goal 2", "tick 0"]
-    with pytest.raises(PerchError, match="'park' is none of its"):
+    with pytest.raises(PerchError, match="'park' is not one of its"):
         LocalParticipant(Asking(Nothing()), await_goal="park")
 
 
@@ -456,7 +456,7 @@ def test_a_batch_that_is_cut_short_is_refused():
     stamp, read = unpack(data, None)
     assert stamp == 5 and [(p.channel, p.data) for p in read] == [(p.channel, p.data) for p in packets]
     for length in range(len(data)):
-        with pytest.raises(PerchError, match="no batch"):
+        with pytest.raises(PerchError, match="not a batch"):
             unpack(data[:length], None)
 
 

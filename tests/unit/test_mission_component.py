@@ -379,7 +379,7 @@ def test_states_that_were_overtaken_do_not_undo_the_newer_ones_and_one_of_the_fu
 
     world = Reordered().send().run()
     assert world.goal.ending == "succeeded"
-    assert ("controller/status: of" in world.said) == (older > 0)
+    assert ("controller/status: stamp" in world.said) == (older > 0)
 
 
 def test_a_vehicle_that_was_started_again_ends_the_goal_and_takes_the_next():

@@ -167,7 +167,7 @@ NONSENSE = [
     ({"waypoints": np.ones((1000, 3))}, B, "waypoints: 1000 entries are more than 50"),
     ({"waypoints": np.array([[1.0, NAN, 1.0]])}, B, "waypoints: nan"), ({"segment_times": (1.0, 2.0)}, B, "segment_times"),
     ({"segment_times": (999.0,)}, B, "segment_times: 999 is outside"), ({"segment_times": (NAN,)}, B, "segment_times: nan"),
-    ({"p": np.array([-1000.0, 0.0, 1.4])}, X, "1001.7 m, longer than speed_max 12 m/s goes in duration_max 20 s"),
+    ({"p": np.array([-1000.0, 0.0, 1.4])}, X, "1001.7 m, longer than speed_max 12 m/s covers in duration_max 20 s"),
     ({"impact_acceleration": -1.0}, B, "impact_acceleration"), ({"impact_acceleration": math.inf}, B, "impact_acceleration"),
     ({"impact_speed_min": 2.0}, B, "impact_speed"), ({"thrust_max": 1e308}, B, "thrust_max"), ({"thrust_min": 900.0}, B, "empty"),
     ({"thrust_ratio": 0.2}, B, "cannot lift"), ({"thrust_ratio": -1.0}, B, "thrust_ratio"), ({"thrust_ratio": NAN}, B, "thrust_ratio"),
