@@ -89,7 +89,8 @@ def _timeline(flight: Flight) -> list[tuple[float, str]]:
     started = set()
     for _, order in flight.values("trajectory"):
         kind = {0: "move", 1: "perch", 2: "landing", 3: "powerline perch with recovery"}[order.at_end]
-        recovery = f", of which {order.trajectory.duration - order.recovery_start:.2f} s are recovery" if order.recovery_start > 0.0 else ""
+        rest = order.trajectory.duration - (order.contact_after or order.trajectory.duration)
+        recovery = f", of which {rest:.2f} s are recovery" if rest > 0.0 else ""
         verb = "is re-planned, what remains takes" if order.id in started else "starts, takes"
         started.add(order.id)
         rows.append((order.trajectory.start_time, f"trajectory {order.id} ({kind}) {verb} {order.trajectory.duration:.2f} s{recovery}"))
