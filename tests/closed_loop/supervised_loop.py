@@ -16,9 +16,9 @@ from perch_autopilot.supervised_link import COMMAND, LinkSupervisor
 from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.watchdog import DESCENT, OFF, ON, Watchdog
 from perch_core import so3
-from perch_sim.timing import CONTROL_PERIOD_NS
 from perch_core.values import NANOSECONDS
 from perch_core.vehicle import Vehicle
+from perch_sim.timing import CONTROL_PERIOD_NS
 
 _PATIENCE = 20.0  # for the firmware's answer to a frame [s]
 

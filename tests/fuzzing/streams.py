@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from perch_core.component import Action, Client, Component, Input, Service, Timer, ports
-from perch_sim.timing import CONTROL_PERIOD
 from perch_core.values import CameraImage
 from perch_eval.goal import goal_of
 from perch_eval.in_process.flights import Sensing, arrange
@@ -18,6 +17,7 @@ from perch_sim.drawing import OnDemandRendering
 from perch_sim.parameters import VehicleParameters
 from perch_sim.scenario import Scenario, load_scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
+from perch_sim.timing import CONTROL_PERIOD
 
 SEED = 1
 LONGEST = 20.0  # of a flight [s]

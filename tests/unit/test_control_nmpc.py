@@ -27,11 +27,11 @@ from perch_core import so3
 from perch_core.compiled import compiler
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import RotorModel
-from perch_sim.timing import CONTROL_PERIOD
 from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import ControlGains, load_vehicle
 from perch_planner.powerline import problem
 from perch_sim.scenario import load_scenario
+from perch_sim.timing import CONTROL_PERIOD
 
 SNAPDRAGON, RPG = load_vehicle("snapdragon"), load_vehicle("rpg")
 
