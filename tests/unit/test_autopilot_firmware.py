@@ -184,7 +184,7 @@ def test_a_firmware_that_freezes_is_named(tmp_path, monkeypatch):
     program.write_text("#!/bin/sh\nexec sleep 60\n")
     program.chmod(0o700)
     (tmp_path / f"{loaded.identity}.eeprom").touch()
-    monkeypatch.setattr(firmware, "found", lambda: program)
+    monkeypatch.setattr(firmware, "find_program", lambda: program)
     monkeypatch.setattr(sitl, "_START", 0.1)
     monkeypatch.setattr(sitl, "IsolatedProgram", lambda *words: launched.append(IsolatedProgram(*words)) or launched[-1])
     with pytest.raises(sitl.FirmwareTimeoutError, match="does not open its port"):
