@@ -39,8 +39,8 @@ def figures(quick: bool) -> list[Figure]:
         out += [figure(f"tags: position error, {name}", "cm", 100 * errors[:, 0], bar_cm),
                 figure(f"tags: attitude error, {name}", "deg", np.degrees(errors[:, 1]), bar_deg),
                 figure(f"tags: attitude p90, {name}", "deg", [np.degrees(np.percentile(errors[:, 1], 90))], 2.0)]
-    everything = [figure("tags: frame", "ms", tracking + first, 15.0),
-                  figure("tags: frame, tracking", "ms", tracking, 10.0),
+    everything = [figure("tags: frame", "ms", tracking + first, 8.0),
+                  figure("tags: frame, tracking", "ms", tracking, 8.0),
                   figure("tags: frame, searching (10 Hz at most)", "ms", first),
                   figure("tags: all four within 1 s", "share", [float(np.mean(acquired))], 0.99, "min >="),
                   figure("tags: flips", "frames", [float(flips)], 0.0, "max ==")]

@@ -31,7 +31,7 @@ def figures(quick: bool) -> list[Figure]:
     for (scenario, _), one in with_progress(in_processes(_fly, tasks), len(tasks), unit="perches"):
         flown[scenario].append(one)
     costs = [cost for one in sum(flown.values(), []) for cost in one.costs]
-    out = [figure("vio: frame (CPU time)", "ms", costs, 10.0), figure("vio: frame p99 (CPU time)", "ms", costs, 20.0, "p99 <="), *ukf]
+    out = [figure("vio: frame (CPU time)", "ms", costs, 8.0), figure("vio: frame p99 (CPU time)", "ms", costs, 16.0, "p99 <="), *ukf]
     for scenario, name in SCENARIOS:
         flights = flown[scenario]
         axes = np.array([one.rmse for one in flights])

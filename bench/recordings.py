@@ -71,6 +71,7 @@ RECORDINGS = {
     "pldm": Recording("PLDM", "the same, in mountains", ("SnorkerHeng/PLD-UAV/PLDM",), "none named", scores.traced),
 }
 MISSING = "not available"
+RACING_ERROR_MAX = 0.2  # required of every seed: error at the end of racing motion, share of the path [%]
 INTRODUCTION = """
 What `scripts/perceive.py` makes of public recordings and photographs of real sensors, against their repositories' own references.
 Nothing is random but which six tags of the clipboard make a board (fixed seed). The recordings are not part of this repository;
@@ -100,13 +101,16 @@ OpenVINS and VINS-Mono report some centimetres of ATE on the whole of V1_01 (58 
 pupil-apriltags (`pip install pupil-apriltags`) with `quad_decimate` 1 on the same images, beside:
 """
 WIRES = """
-The clipboard's reference is the calibration over all its images and tags, and over the distances between its rows and columns: the
-paper is not flat. The rotation series is scored with its repository's calibration.
+NASA's reference lacks tags: a detection beyond it is false unless it is on a tag of number 0 that was seen by eye (their places are
+`UNLISTED` in `bench/recordings_scores.py`). The clipboard's reference is the calibration over all its images and tags, and over the
+distances between its rows and columns: the paper is not flat. The rotation series is scored with its repository's calibration.
 
 ## Wires
 
 By length, within 8 px of what is traced (which are a wire's edges). PLDU and PLDM: all photographs of the published test sets, every
-sixth of which was used to choose thresholds. The street's wires are not traced.
+sixth of which was used to choose thresholds. The street's wires are not traced: the arcs in these pictures were judged by eye, and a point
+was marked on each that is on a wire (`WIRES_SEEN`). The others follow window frames, joints in a wall, edges of roofs
+and walls, and poles.
 """
 END = """
 In rooms arcs are edges of doors and folds of curtains, on NASA's photographs painted lines. What lies on a surface is distinguished from a
@@ -127,9 +131,17 @@ def motion(f: Figures) -> list[str]:
             f"{vio['attitude_rms_deg']:.2f} deg", f"{vio['nees_position_mean']:.1f}", str(f["restarts"])]
 
 
+def race(f: Figures) -> list[str]:
+    """Cells of a row on racing motion."""
+    errors = f["error_percent"]
+    within = sum(error <= RACING_ERROR_MAX for error in errors)
+    return [f["flight"], f"{f['path_m']:.1f} m", ", ".join(f"{error:.2f}" for error in errors) + " %",
+            f"{'holds' if within == len(errors) else 'fails'} ({within} of {len(errors)})", f"{f['nees']:.1f}", str(f["lost"])]
+
+
 def corners(f: Figures) -> str:
     """Return the result on NASA's tags as text."""
-    others = f"; {f['others']} more than the reference has" if f["others"] else ""
+    others = f"; {f['others']} more than the reference has, {f['false']} false" if f["others"] else ""
     return (f"{f['found']} of {f['reference']} found, corners {f['corner_px_median']:.2f} px median "
             f"({f['corner_px_p90']:.2f} px at 90 %){others}")
 
@@ -166,6 +178,11 @@ def wires(f: Figures) -> str:
             f"{f['precision_without_a_sixth']:.1f} and {f['recall_without_a_sixth']:.1f} percentage points)")
 
 
+def judged(f: Figures) -> str:
+    """Return the result on the street's wires as text."""
+    return f"{f['arcs']} arcs in {f['photographs']} photographs, {f['arcs'] - f['wires']} of them not on wires, by eye"
+
+
 def page(results: Mapping[str, Figures], command: str) -> list[str]:
     """Lines of README.md; `results`: figures by key of the recording."""
     def row(key: str, text: Callable[[Figures], str], what: str = "") -> list[str]:
@@ -189,15 +206,14 @@ def page(results: Mapping[str, Figures], command: str) -> list[str]:
                   f"{f['frames']['RESTING']} of {f['images']['cam0']} frames. The estimator's attitude is wrong by "
                   f"{f['estimator']['attitude_rms_deg']:.2f} deg from the start on.", V101]
     if "racing" in results:
-        lines += [RACING, *table("flight | path | final error of each seed | NEES over 3 | frames lost", (
-            [f["flight"], f"{f['path_m']:.1f} m", ", ".join(f"{error:.2f}" for error in f["error_percent"]) + " %", f"{f['nees']:.1f}",
-             str(f["lost"])] for f in results["racing"]["flights"]))]
+        lines += [RACING, *table(f"flight | path | final error of each seed | required: at most {RACING_ERROR_MAX} % | NEES over 3 | frames lost",
+                                 map(race, results["racing"]["flights"]))]
     return [*lines, TAGS, *table("recording | ours | pupil-apriltags", (
         pair("nasa", corners), pair("rotation", turns),
         pair("rooms", lambda f: f"{f['found']} of {f['reference']} found, {f['false']} false"),
         [*row("aprilgrid", grid), "-"], [*row("floor", board), "-"], [*row("clipboard", poses, ", poses of six tags"), "-"])),
             WIRES, *table("recording | found", (
-                row("pldu", wires), row("pldm", wires), row("street", lambda f: f"{f['arcs']} arcs in {f['photographs']} photographs"),
+                row("pldu", wires), row("pldm", wires), row("street", judged),
                 arcs("rotation"), arcs("rooms"), arcs("nasa"),
                 *(row(key, lambda f: f"{f['powerlines']} wires in the map", ", without wires") for key in ("v101", "floor")))), END]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from perch_core.sensors import load_sensors
+from perch_core.sensors import ImuSensor, load_sensors
 from perch_core.values import CameraImage
 from perch_eval.recordings import camera_check, sensors_command
 from perch_eval.recordings.check import check
@@ -139,12 +139,12 @@ def test_rest_is_seen_whatever_the_bias(bias):
     assert first == 0 and 2.7 < t[last] < 3.3
 
 
-def findings(stamps, still):
-    """{about: finding} of an IMU that turns where it is not still."""
+def findings(stamps, still, sensor=None, off=np.zeros(6)):
+    """{about: finding} of an IMU that turns where it is not still, and whose readings are off by `off`."""
     t = 0.005 * np.arange(len(still))
-    imu = np.hstack([np.where(still, 0.0, np.sin(5.0 * t))[:, None] * (1.0, 0.0, 0.0), np.tile([0.0, 0.0, 9.81], (len(t), 1))])
+    imu = np.hstack([np.where(still, 0.0, np.sin(5.0 * t))[:, None] * (1.0, 0.0, 0.0), np.tile([0.0, 0.0, 9.81], (len(t), 1))]) + off
     report = Report()
-    check_imu(report, stamps, imu + 0.01 * np.random.default_rng(8).standard_normal(imu.shape), None)
+    check_imu(report, stamps, imu + 0.01 * np.random.default_rng(8).standard_normal(imu.shape), sensor)
     return {finding.about: finding for finding in report.findings}
 
 
@@ -154,6 +154,19 @@ def test_rest_at_the_start_counts_though_another_is_longer():
     rest = findings(stamps, (t < 2.0) | (t > 7.0))["rest"]
     assert rest.level == "ok" and "from 7.0 s on, for 2.0 s at the start" in rest.text
     assert findings(stamps, t > 7.0)["rest"].level == "warning"
+
+
+@pytest.mark.parametrize("axis, bias, about, level", [
+    (5, 0.25, "accel bias", "ok"), (5, -0.25, "accel bias", "ok"), (5, 0.35, "accel bias", "warning"), (5, -0.35, "accel bias", "warning"),
+    (3, 0.35, "accel bias", "ok"),  # across gravity a bias looks like a tilt
+    (1, 0.05, "gyro bias", "ok"), (1, -0.07, "gyro bias", "warning"), (2, 0.07, "gyro bias", "warning")])
+def test_means_at_rest_are_within_three_sigma_of_the_turn_on_bias(axis, bias, about, level):
+    sensor = ImuSensor(rate=200.0, accel_noise_density=0.01, gyro_noise_density=0.01, accel_bias_walk=0.002, gyro_bias_walk=2e-4,
+                       accel_bias=0.1, gyro_bias=0.02)
+    found = findings(5_000_000 * np.arange(1000), np.full(1000, True), sensor, bias * np.eye(6)[axis])
+    assert found[about].level == level and ("3 sigma of the sensor file" in found[about].text) == (level == "warning")
+    assert found["imu rate"].level == "ok" and "imu units" not in found
+    assert all(f.level == "ok" for name, f in found.items() if name != about)
 
 
 def test_stamps_that_are_none_fail():

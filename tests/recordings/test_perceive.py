@@ -123,6 +123,32 @@ def test_a_folder_of_images(flight, tmp_path):
         assert np.abs(tags[number] - pixels).max() < 1.0
 
 
+def test_parameters_apply_to_images_or_are_refused(flight, files, tmp_path, capsys):
+    floor, wire, out = tmp_path / "floor.png", tmp_path / "wire.png", tmp_path / "out"
+    cv2.imwrite(str(floor), flight.images[5])
+    drawn = np.full((240, 320, 3), 120, np.uint8)
+    cv2.line(drawn, (100, 100), (160, 110), (60, 60, 180), 3, cv2.LINE_AA)  # too short for one without a colour
+    cv2.imwrite(str(wire), drawn)
+
+    def detections(image, *arguments):
+        assert perceive(image, "--out", out, *arguments) == 0
+        return json.loads((out / "detections.json").read_text())[image.name]
+
+    calibrated = ("--sensors", files / "mine.yaml")
+    assert "board" in detections(floor, *calibrated)
+    near = detections(floor, *calibrated, "-p", "target_localizer.max_range:=0.2")
+    assert "board" not in near and near["message"]
+    red = ("-p", "powerline_mapper.detection.appearance:=red")
+    assert [len(detections(wire, *more)["wires"]) for more in ((), red, (*red, "-p", "powerline_mapper.detection.redness:=150"))] == [0, 1, 0]
+    capsys.readouterr()
+    for parameter, words in (("vio.filter.clones:=8", "does not apply to images"), ("target_localizer.mode:=fused", "does not apply to images"),
+                             ("powerline_mapper.rate:=5.0", "does not apply to images"), ("target_localizer.board:=none", "unknown"),
+                             ("powerline_mapper.detection.redness:=999", "redness"), ("controller.x:=1", "is not one of")):
+        assert perceive(wire, "--out", out, "-p", parameter) == 2, parameter
+        said = capsys.readouterr().err.strip().splitlines()
+        assert len(said) == 1 and said[0].startswith("error: ") and words in said[0], said
+
+
 def test_what_cannot_be_done_is_said_in_a_line(files, tmp_path, capsys):
     broken, empty, elsewhere = tmp_path / "broken.mcap", tmp_path / "empty", tmp_path / "truth.tum"
     whole = next((files / "mcap").glob("*.mcap")).read_bytes()

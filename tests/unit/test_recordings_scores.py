@@ -25,6 +25,18 @@ def test_a_tag_is_found_where_one_of_its_number_is_within_half_its_side():
     assert len(errors) == 1 and errors[0] == pytest.approx(0.5)
 
 
+def test_a_tag_beyond_the_reference_is_false_unless_it_was_seen_there():
+    reference, unlisted = [(0, SQUARE)], [(120, 120)]
+    for tag, seen in (((0, SQUARE + 1.0), True), ((0, SQUARE + 100.0), True), ((0, SQUARE + 111.0), False), ((1, SQUARE + 100.0), False)):
+        assert scores._is_seen(tag, reference, unlisted) == seen
+
+
+def test_an_arc_is_on_a_wire_where_it_passes_a_point_of_it():
+    arc = np.stack([np.linspace(0.0, 400.0, 9), 100.0 + np.linspace(-1.0, 1.0, 9)**2 * 40.0], axis=1)
+    assert scores._is_on(arc, [(0, 0), (200, 107)]) and scores._is_on(arc, [(225, 100)])
+    assert not scores._is_on(arc, [(200, 109), (410, 140)]) and not scores._is_on(arc, [])
+
+
 def test_apriltags_corners_are_in_our_order_and_pixels():
     """AprilTag's (lb, rb, rt, lt) are OpenCV's (TR, TL, BL, BR), and it counts pixels from the first one's corner."""
     lb, rb, rt, lt = SQUARE
@@ -66,6 +78,11 @@ def bench(monkeypatch):
 def test_a_page_without_recordings_says_so(bench):
     page = "\n".join(bench.page({}, "a command"))
     assert page.count(bench.MISSING) == 16 and all(recording.title in page for recording in bench.RECORDINGS.values())
+
+
+@pytest.mark.parametrize("errors, verdict", [([0.1, 0.2], "holds (2 of 2)"), ([0.1, 0.21, 0.3], "fails (1 of 3)")])
+def test_racing_motion_holds_where_every_seed_does(bench, errors, verdict):
+    assert verdict in bench.race({"flight": "a", "path_m": 40.0, "error_percent": errors, "nees": 1.0, "lost": 0})
 
 
 def test_the_page_is_that_of_its_figures(bench):

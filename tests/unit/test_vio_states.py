@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_core.values import ImuSample
+from perch_core.imu_axes import ImuAxes
+from perch_core.values import ImuSample, Transform
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
@@ -37,17 +38,20 @@ class GivenTracks(Tracker):
 
 
 class Flown:
-    """A climb to a hover; the ground is a blur up to 0.3 m. The IMU's biases are large."""
+    """A climb to a hover; the ground is a blur up to 0.3 m. The IMU's biases, given in its own axes, are large."""
 
-    def __init__(self, rate, begin=0.0, seed=1):
+    def __init__(self, rate, begin=0.0, seed=1, q_BI=(0.0, 0.0, 0.0, 1.0), gyro_bias=GYRO_BIAS):
         self.rng, self.motion, self.rate = np.random.default_rng(seed), PerchMotion(seed=seed), rate
         self.begin, self.tracks, self.now = begin, SimulatedTracks(np.random.default_rng(seed), 0.2), 0.0
         times = np.arange(begin, self.motion.perch_time, 1.0 / rate)
         noise = np.sqrt(rate / 500.0)  # the same density
         imu = replace(VEHICLE.imu, rate=rate, accel_noise=VEHICLE.imu.accel_noise * noise, gyro_noise=VEHICLE.imu.gyro_noise * noise)
         read = read_imu(self.motion.sample(times), imu, self.rng)
-        gyro, accel = read.gyro + GYRO_BIAS, read.accel + ACCEL_BIAS
-        self.samples = [ImuSample(round(t * 1e9), tuple(w), tuple(f)) for t, w, f in zip(times, gyro.tolist(), accel.tolist())]
+        axes, R_BI = ImuAxes(pytest.fail), so3.quat_to_matrix(np.array(q_BI))
+        axes.add_transform(Transform("base_link", "turned", (0.0, 0.0, 0.0), q_BI))
+        gyro, accel = read.gyro @ R_BI + gyro_bias, read.accel @ R_BI + ACCEL_BIAS
+        self.gyro_bias = R_BI @ gyro_bias
+        self.samples = [axes.in_body(ImuSample(round(t * 1e9), w, f, "turned")) for t, w, f in zip(times, gyro, accel)]
         config = VioConfig()
         config = replace(config, imu=replace(config.imu, accel_bias_init=0.6), filter=replace(config.filter, pixel_noise=0.2))
         start = self.motion.sample(np.array([begin])).p_WB[0]
@@ -77,22 +81,25 @@ class Flown:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("begin, rate", [(0.0, 100.0), (0.0, 1000.0), (1.9, 100.0), (1.9, 1000.0)])
-def test_large_biases_are_found(begin, rate):
-    """From rest, and switched on in motion."""
-    flown = Flown(rate, begin)
+@pytest.mark.parametrize("begin, rate, more", [
+    (0.0, 100.0, {}), (0.0, 1000.0, {}), (1.9, 100.0, {}), (1.9, 1000.0, {}),
+    (1.9, 100.0, dict(q_BI=(1.0, 0.0, 0.0, 0.0), gyro_bias=-GYRO_BIAS)),  # forward, right, down
+    (1.9, 1000.0, dict(q_BI=(np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0), gyro_bias=np.array([0.0, 0.2, 0.0])))])  # up, right, forward
+def test_large_biases_are_found(begin, rate, more):
+    """From rest, and switched on in motion; the axes of the IMU may be turned in the body."""
+    flown = Flown(rate, begin, **more)
     seen = flown.fly()
     first = seen[0][1]
     if begin == 0.0:
         assert first.outcome is FrameOutcome.RESTING and seen[0][0] < 0.5
-        np.testing.assert_allclose(first.estimate.gyro_bias, GYRO_BIAS, atol=0.02)
+        np.testing.assert_allclose(first.estimate.gyro_bias, flown.gyro_bias, atol=0.02)
         assert {r.outcome for t, r, _, _ in seen if 0.5 < t < 1.0} == {FrameOutcome.RESTING}
     else:
         assert first.outcome is FrameOutcome.TRACKING
-        np.testing.assert_allclose(first.estimate.gyro_bias, GYRO_BIAS, atol=0.05)
+        np.testing.assert_allclose(first.estimate.gyro_bias, flown.gyro_bias, atol=0.05)
     _, last, v, tilt = seen[-1]
     assert last.outcome is FrameOutcome.TRACKING and last.restarts == 0
-    np.testing.assert_allclose(last.estimate.gyro_bias, GYRO_BIAS, atol=0.03)
+    np.testing.assert_allclose(last.estimate.gyro_bias, flown.gyro_bias, atol=0.03)
     # a bias across g looks like a tilt: 1 m/s^2 is 5.8 deg at rest, and a climb tells little of it
     estimate = last.estimate
     level = np.eye(3) - np.outer(estimate.R_WB[2], estimate.R_WB[2])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from perch_core import so3
+from perch_core import config, so3
 from perch_core.errors import ConfigError, PerchError
 from perch_core.json_values import write_json
 from perch_core.processes import single_threaded_blas
@@ -24,16 +24,20 @@ from perch_eval.recordings.check import check
 from perch_eval.recordings.evaluation import Evaluation, evaluate
 from perch_eval.recordings.drawing import Gallery
 from perch_eval.recordings.opening import open_recording
-from perch_eval.recordings.perception import Perception
+from perch_eval.recordings.perception import Perception, node_config
 from perch_eval.recordings.image_detections import detect, draw_detections, guessed_mount
 from perch_eval.recordings.recording import Recording, RecordingError
 from perch_eval.recordings.report import ReportContent, bias_figure, error_figure, frames_figure, path_figure
 from perch_eval.recordings.trajectory import Trajectory, read_truth, write_tum
 from perch_perception.images import ImageError
-from perch_perception.line_mapping import LineDetectionConfig
+from perch_perception.powerline_mapper import PowerlineMapperConfig
+from perch_perception.target_localizer import TargetLocalizerConfig
 
 NODES = ("vio", "estimator", "target_localizer", "powerline_mapper")
 OPTIONAL = NODES[2:]
+IN_IMAGES = ("target_localizer.board", "target_localizer.max_range",
+             "powerline_mapper.detection.appearance", "powerline_mapper.detection.redness")
+"""Parameters that apply to images without an IMU."""
 EXAMPLES = """examples:
   python3 scripts/perceive.py V1_01_easy --out out/v101                 EuRoC's folder: calibration and truth are in it
   python3 scripts/perceive.py flight.mcap --sensors mine.yaml --truth mocap.tum --out out/flight
@@ -80,7 +84,7 @@ def _perceive(args: argparse.Namespace) -> int:
     if recording.samples == 0 or sensors is None or sensors.imu is None:
         if recording.samples and sensors is None:
             raise PerchError(f"{args.recording}: has an IMU and no calibration: give --sensors FILE, made by `scripts/sensors.py import`")
-        return _detect_in_images(args, recording)
+        return _detect_in_images(args, recording, overrides)
     if truth is not None:  # it is that of the IMU's axes, as EuRoC's is
         truth = truth.turned(so3.quat_from_matrix(sensors.imu.R_BI.T))
     return _run(args, recording, sensors, truth, overrides)
@@ -217,18 +221,25 @@ def _trajectory(states: Sequence[InertialState] | Sequence[OdometryState]) -> Tr
 # -- images alone ----------------------------------------------------------------------------------------------------
 
 
-def _detect_in_images(args: argparse.Namespace, recording: Recording) -> int:
-    board, gallery, problems, detections = load_board(args.board), Gallery(24), [], {}
+def _detect_in_images(args: argparse.Namespace, recording: Recording, overrides: dict[str, dict[str, Any]]) -> int:
+    for name in config.flattened(overrides):
+        if name not in IN_IMAGES:
+            raise PerchError(f"-p {name}: does not apply to images without an IMU; these do: {', '.join(IN_IMAGES)}")
+    target = node_config("target_localizer", TargetLocalizerConfig, {"board": args.board}, overrides)
+    board, gallery, problems, detections = load_board(target.board), Gallery(24), [], {}
+    cameras = recording.sensors.cameras if recording.sensors else {}
+    appearances = {camera: "red" if camera in cameras and cameras[camera].colour else "plain" for camera in recording.images}
+    wires = {camera: node_config("powerline_mapper", PowerlineMapperConfig, {"detection.appearance": appearance}, overrides).detection
+             for camera, appearance in appearances.items()}
     for event in recording.read():
         image = event.value
         if not isinstance(image, CameraImage):
             continue
         name = getattr(image, "path", Path(str(image.stamp))).name
-        sensor = recording.sensors.cameras.get(event.source) if recording.sensors else None
+        sensor = cameras.get(event.source)
         mount = sensor.mount(event.source) if sensor else guessed_mount(event.source, image.width, image.height)
-        wires = LineDetectionConfig(appearance="red" if sensor and sensor.colour else "plain")
         try:
-            found = detect(image, mount, board, wires, sensor is not None)
+            found = detect(image, mount, board, wires[event.source], sensor is not None, target.max_range)
         except ImageError as error:
             problems.append(f"{name}: {error}")
             continue

@@ -57,7 +57,8 @@ def guessed_mount(name: str, width: int, height: int) -> CameraMount:
     return CameraMount(name, PinholeCamera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1)), np.zeros(3), np.eye(3))
 
 
-def detect(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDetectionConfig, calibrated: bool) -> ImageDetections:
+def detect(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineDetectionConfig, calibrated: bool,
+           max_range: float = 6.0) -> ImageDetections:
     """Detect tags, board and wires in one image.
 
     Args:
@@ -66,13 +67,16 @@ def detect(image: CameraImage, mount: CameraMount, board: TagBoard, wires: LineD
         board: whose pose is estimated.
         wires: settings of the detection of wires.
         calibrated: whether the camera is calibrated; otherwise no pose is estimated.
+        max_range: a board further away is taken for one of another size [m].
 
     Raises:
         ImageError: it is not of the camera's size or has no pixels.
     """
     grey = mono_image(image, mount.camera)
     tags = find_tags(grey, mount.camera, board)
-    found = BoardLocalizer(board, mount).process(grey, 0.0) if calibrated else Localization(None, message="the camera is not calibrated: no pose")
+    found = Localization(None, message="the camera is not calibrated: no pose")
+    if calibrated:
+        found = BoardLocalizer(board, mount, max_range).process(grey, 0.0)
     pixels = rgb_image(image, mount.camera) if wires.appearance == "red" else grey
     return ImageDetections(tags, found.board, found.message, detect_lines(pixels, mount.camera, wires), mount)
 

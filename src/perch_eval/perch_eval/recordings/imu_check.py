@@ -10,6 +10,8 @@ from perch_eval.recordings.findings import Report, check_rate
 
 STILL_WINDOW = 0.2  # [s]
 STILL_MEAN = (0.02, 0.2)  # by how much a window's mean may differ from those before it, at rest [rad/s, m/s^2]
+GYRO_BIAS_MAX = 0.2  # mean at rest above which a warning is given, whatever the sensor file allows [rad/s]
+BIAS_SIGMAS = 3.0  # by how many sigma of the turn-on bias a mean at rest may be off
 STILL_SIGMA = (0.3, 2.0)  # 1 sigma within a window: rotors that idle shake the vehicle, but do not move it [rad/s, m/s^2]
 
 
@@ -52,13 +54,29 @@ def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSe
                (": not at the start, so that VIO begins in motion" if at_start < 0.5 else
                 f", for {at_start:.1f} s at the start" if at_start < duration else ""),
                warning=at_start < 0.5)
-    bias = gyro[first:last].mean(axis=0)
-    report.figures |= {"gyro_bias": bias.tolist(), "force_at_rest": float(np.linalg.norm(accel[first:last].mean(axis=0)))}
-    report.add("gyro bias", f"{np.linalg.norm(bias):.4f} rad/s at rest", warning=bool(np.linalg.norm(bias) > 0.2))
+    _check_biases(report, gyro[first:last].mean(axis=0), accel[first:last].mean(axis=0), sensor)
     if shared > 0.01:
         report.add("noise", f"not judged: {100 * shared:.0f} % of the samples have the stamp of the one before")
     else:
         _check_noise(report, imu[first:last], rate, sensor)
+
+
+def _check_biases(report: Report, gyro: np.ndarray, accel: np.ndarray, sensor: ImuSensor | None) -> None:
+    """Check the means at rest [rad/s, m/s^2], shape (3,), against the turn-on biases of the sensor file.
+
+    At rest only the accelerometer's bias along gravity can be observed: across it, it looks like a tilt.
+    """
+    rate, force = float(np.linalg.norm(gyro)), float(np.linalg.norm(accel))
+    report.figures |= {"gyro_bias": gyro.tolist(), "force_at_rest": force}
+    allowed = BIAS_SIGMAS * sensor.gyro_bias if sensor is not None else np.inf
+    more = bool(np.abs(gyro).max() > allowed)
+    report.add("gyro bias", f"{rate:.4f} rad/s at rest" + (f": an axis has more than {allowed:.2g}, {BIAS_SIGMAS:g} sigma of the sensor file"
+                                                           if more else ""), warning=more or rate > GYRO_BIAS_MAX)
+    if sensor is not None:
+        allowed = BIAS_SIGMAS * sensor.accel_bias
+        more = abs(force - GRAVITY) > allowed
+        report.add("accel bias", f"the specific force at rest differs from gravity by {force - GRAVITY:+.3f} m/s^2" +
+                   (f": more than {allowed:.2g}, {BIAS_SIGMAS:g} sigma of the sensor file" if more else ""), warning=more)
 
 
 def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor | None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,11 @@ from perch_perception.images import mono_image, rgb_image
 from perch_perception.powerline_mapper import PowerlineMapper
 from perch_perception.target_localizer import TargetLocalizer
 from perch_perception.vio_component import VioComponent
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 
 MAX_POSITION_SIGMA = 100.0  # 1 sigma of a position that is kept [m]
 TAIL = 8  # frames of history in a picture of tracks
@@ -121,6 +126,16 @@ class _Wires(PowerlineMapper):
         return GalleryImage(image.stamp, f"{len(wires)} wires", caption(drawn, f"{len(wires)} wires"))
 
 
+def node_config(node: str, config_type: type[T], given: Mapping[str, Any], overrides: Mapping[str, Mapping[str, Any]]) -> T:
+    """Return the configuration of a node: that of `config/<node>.yaml`, the given dotted parameters, then the overrides.
+
+    Raises:
+        ConfigError: a parameter is refused.
+    """
+    parameters = config.flattened(read_parameters(node)) | dict(given) | config.flattened(overrides.get(node, {}))
+    return config.from_mapping(config_type, config.nested(parameters), node)
+
+
 class Perception:
     """VIO, estimator, target localiser and powerline mapper, and their outputs.
 
@@ -195,8 +210,7 @@ class Perception:
         """Create a component with the parameters of its node; None if it is left out."""
         if node in self._without:
             return None
-        parameters = config.flattened(read_parameters(node)) | dict(given) | config.flattened(self._overrides.get(node, {}))
-        component = cls(config.from_mapping(cls.config_type, config.nested(parameters), node))
+        component = cls(node_config(node, cls.config_type, given, self._overrides))
         component.log.receivers.append(lambda line: self._record_log(node, line))
         return component
 
