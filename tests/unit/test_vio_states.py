@@ -12,6 +12,7 @@ from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.vio import FrameOutcome, VioConfig, VisualInertialOdometry
 from perch_perception.vio import state as at
+from perch_perception.vio.divergence import divergence
 from perch_perception.vio.msckf import Msckf
 from perch_perception.vio.start import configured_pose, initial_state
 from perch_perception.vio.tracker import Features, Tracker
@@ -147,6 +148,13 @@ def test_a_filter_that_does_not_fit_what_it_sees_starts_again_and_says_so():
     lost = [r for _, r, _ in out if r.message.startswith("lost:") and r.outcome is FrameOutcome.LOST]
     assert lost and "refused" in lost[0].message and lost[0].estimate is None
     assert out[-1][1].restarts >= 1
+
+
+@pytest.mark.parametrize("used, refused, lost", [(19, 24, False), (20, 81, True), (0, 21, True), (0, 20, False)])
+def test_bad_tracks_alone_do_not_end_the_filter(used, refused, lost):
+    """It is lost where it refuses nearly all that it sees."""
+    state = initial_state(VioConfig(), MOUNT, 0, np.eye(3), configured_pose(np.zeros(3), 0.0), np.zeros(3), np.zeros(3), 0.01, 0.01, 0.01)
+    assert bool(divergence(state, used, refused, 15)) is lost
 
 
 @pytest.mark.parametrize("change, words", [

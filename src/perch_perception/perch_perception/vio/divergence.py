@@ -8,6 +8,7 @@ from perch_perception.vio import state as at
 
 SPEED_MAX = 25.0  # faster flies no vehicle that this is for [m/s]
 _MIN_REFUSED = 20  # observations that may be refused, however few are used
+_REFUSED_PER_USED = 4.0  # a filter that is right refuses bad tracks, one that is wrong nearly all: more than this for each that it uses
 _MAX_VELOCITY_SIGMA = 1.0  # largest 1 sigma of the velocity [m/s]
 
 
@@ -27,7 +28,7 @@ def divergence(state: at.State, used: int, refused: int, frames: int) -> str:
     speed, gyro, accel = (float(np.linalg.norm(v)) for v in (state.v_WB, state.gyro_bias, state.accel_bias))
     if not np.isfinite(state.P).all() or not np.isfinite(state.p_WB).all():
         return "state is not finite"
-    if refused > max(used, _MIN_REFUSED):
+    if refused > max(_REFUSED_PER_USED * used, _MIN_REFUSED):
         return f"{refused} observations refused and {used} used in {frames} frames"
     if (sigma := velocity_sigma(state)) > _MAX_VELOCITY_SIGMA:
         return f"velocity known only to {sigma:.1f} m/s"
