@@ -24,11 +24,9 @@ SLOW_IMPACT = PerchSettings(impact_speed_min=0.5, impact_speed_max=0.6, contact_
 """An impact that takes less room than the shipped one."""
 
 
-def surface(inclination_deg: float, heading_deg: float = 0.0, p=(1.7, 0.0, 1.5)) -> PerchSurface:
-    if inclination_deg < 30.0:
-        p = (1.7, 0.0, 0.8)
-    if inclination_deg > 140.0:  # the vehicle rises as it turns over, from the lower the further
-        p = (1.7, 0.0, 3.6)
+def surface(inclination_deg: float, heading_deg: float = 0.0, p=None) -> PerchSurface:
+    if p is None:  # the vehicle rises as it turns over, from the lower the further
+        p = (1.7, 0.0, 0.8 if inclination_deg < 30.0 else 1.5 if inclination_deg <= 140.0 else 3.6)
     return PerchSurface.from_inclination(np.array(p), np.radians(inclination_deg), np.radians(heading_deg))
 
 
@@ -226,7 +224,7 @@ def test_a_clearance_that_the_first_plan_lacks_is_kept(waypoint):
     assert least[0] < 0.03 <= least[1]
 
 
-@pytest.mark.parametrize("distance", [0.05, 0.1])
+@pytest.mark.parametrize("distance", [0.05, 0.07])  # at 0.1 m there is a plan
 def test_a_refusal_for_a_waypoint_whose_rim_touches_a_wall_names_the_clearance_that_it_takes(distance):
     problem = PerchProblem(HOVER, surface(90.0), (Waypoint((1.7 - distance, 0.0, 1.5)),))
     with pytest.raises(PerchRefusal, match="clearance") as caught:
@@ -313,11 +311,25 @@ def test_a_refusal_whose_programs_are_used_up_names_limits_without_which_there_i
 
 def test_a_ceiling_near_the_floor_is_refused_for_the_floor():
     """Not for the thrust, of which it would take more than the vehicle has."""
-    problem = PerchProblem(HOVER, surface(179.0, p=(1.7, 0.0, 1.6)))
+    problem = PerchProblem(HOVER, surface(179.0))
     with pytest.raises(PerchRefusal, match="height limits") as caught:
         plan(problem, PerchSettings(height_min=1.2), VEHICLE)
     assert set(caught.value.relaxed) == {"height_min"}
     checked(problem, PerchSettings(**caught.value.relaxed))
+
+
+@pytest.mark.parametrize("deg, height", [(179.0, 1.2), (179.0, 1.5), (180.0, 1.5)])
+def test_a_low_ceiling_is_refused_for_the_floor_from_every_start(deg, height):
+    with pytest.raises(PerchRefusal) as caught:
+        plan(PerchProblem(StartState((0.0, 0.0, height)), surface(deg, p=(1.7, 0.0, 2.0))), PerchSettings(), VEHICLE)
+    assert set(caught.value.relaxed) == {"height_min"}
+
+
+@pytest.mark.parametrize("seed", [700052, 700101, 700114, 700213])
+def test_a_search_that_fails_begins_again_from_other_durations(seed):
+    """Random problems that are planned from the first durations times 1.25 or 0.8 alone."""
+    problem = random_problem(np.random.default_rng(seed))
+    assert checked(problem, PerchSettings()).iterations > search.STARTS[0][1]
 
 
 @pytest.mark.parametrize("make, key", [

@@ -18,7 +18,9 @@ from perch_planner.time_allocation import (
     FINE_DIVISIONS, LAST_SEGMENT_MIN, allocate, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
 from perch_planner.yaw_profile import yaw_coefficients
 
-ITERATIONS_MAX = 100  # quadratic programs of a search
+STARTS = ((1.0, 100), (1.25, 75), (0.8, 75))
+"""First durations of a search, as factors of the allocated ones, and the greatest number of quadratic programs from each."""
+ITERATIONS_MAX = sum(programs for _, programs in STARTS)
 _CUT_ROUNDS = 24
 _EARLY_STRETCHES = 5      # so often, peaks are stretched where a longer time helps most: high ones, and those before the last waypoint
 _SMALL_VIOLATION = 0.03   # violations of the thrust range below this share are cut together with the other limits
@@ -74,7 +76,7 @@ class Search:
 
     def __init__(self, problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle, limits: Limits,
                  iterations_max: int = ITERATIONS_MAX) -> None:
-        self._iterations_max = iterations_max
+        self._iterations_max, self._iterations_end = iterations_max, iterations_max
         self.problem, self.settings, self.vehicle, self.limits = problem, settings, vehicle, limits
         self.low, self.high = limits.thrust[0] / vehicle.mass, limits.thrust[1] / vehicle.mass
         self.contact = Contact(problem, settings, vehicle.perch_offset)
@@ -110,7 +112,7 @@ class Search:
             return no_plan
         best, count, duration = None, 0, float(durations.sum())
         for rounds in range(_CUT_ROUNDS + 1):
-            if rounds and self.iterations >= self._iterations_max:
+            if rounds and self.iterations >= self._iterations_end:
                 break
             check = program.solve_and_check(allow_stretch, rounds > 0)
             if check is None:
@@ -152,13 +154,30 @@ class Search:
         self.active_limits |= {name for name, is_violated in violated.items() if is_violated}
 
     def run(self) -> tuple[np.ndarray, Outcome]:
+        """Search from each of the first durations in `STARTS` until every limit is proved; return the durations and the outcome.
+
+        Longer durations only are reached from each, and the shortest that admit a plan may be missed: which plans violate limits
+        depends on the ratio of the segments, too.
+        """
+        first = None
+        for factor, programs in STARTS:
+            self._iterations_end = min(self.iterations + programs, self._iterations_max)
+            found = self._run_from(with_last_segment(factor * self.initial_durations, self.settings))
+            if found[1].proved:
+                return found
+            first = first or found
+            if self.iterations >= self._iterations_max:
+                break
+        return first
+
+    def _run_from(self, durations: np.ndarray) -> tuple[np.ndarray, Outcome]:
         """Lengthen durations until every limit is proved, or the time or the number of programs is exhausted. [M:IV-C.3]
 
         Where the thrust leaves its range before the last waypoint, all segments grow; otherwise mainly the approach, from the
         third try on only after all its divisions failed. Longer durations are shortened to `duration_max` once, and tried with
         all divisions.
         """
-        durations, best, stretched, fails, at_maximum = self.initial_durations, None, 0, 0, False
+        best, stretched, fails, at_maximum = None, 0, 0, False
         while True:
             if durations.sum() > self.settings.duration_max:
                 self.active_limits.add("duration_max")
@@ -177,7 +196,7 @@ class Search:
                 grown = durations  # the same, with another division
             else:
                 grown, stretched = lengthen_approach(durations, _APPROACH_GROWTH[stretched >= _SMALL_STEPS]), stretched + 1
-            if self.iterations >= self._iterations_max:
+            if self.iterations >= self._iterations_end:
                 return durations, best
             durations = with_last_segment(grown, self.settings)
 
@@ -198,7 +217,7 @@ class Search:
         shortest = max(self.settings.tube_time, LAST_SEGMENT_MIN)
         low, high = min(shortest / durations[-1], 1.0), 1.0
         for _ in range(_BISECTIONS):
-            if high - low < 1e-3 or self.iterations >= self._iterations_max:
+            if high - low < 1e-3 or self.iterations >= self._iterations_end:
                 break
             middle = 0.5 * (low + high)
             tried = self.try_durations(split_last(middle * durations))
