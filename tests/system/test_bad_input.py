@@ -213,7 +213,7 @@ def test_the_mission_refuses_goals_that_are_none(asker):
     asker.wait(client.server_is_ready)
     powerline = {"mode": Perch.Goal.MODE_POWERLINE}
     for fields, path, value, words in (
-            ({}, "mode", 9, "mode 9 is none of SURFACE"), ({}, "takeoff_height", math.inf, "takeoff_height: inf is outside [0.3, 10] m"),
+            ({}, "mode", 9, "mode: 9 is not one of 0 (surface)"), ({}, "takeoff_height", math.inf, "takeoff_height: inf is outside [0.3, 10] m"),
             ({}, "takeoff_height", 0.1, "takeoff_height: 0.1 is outside"), ({}, "search_timeout", -1.0, "search_timeout: -1 is outside [0.001, 300] s"),
             ({}, "inclination_hint", 7.0, "inclination_hint: 7 is outside [0, 3.14159] rad"),
             ({}, "search_pose.pose.position.x", math.nan, "search_position: nan is not finite"),

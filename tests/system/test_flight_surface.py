@@ -21,6 +21,7 @@ import pytest
 from mcap.reader import make_reader
 from perch_eval import demo
 from perch_eval.flight import HASHED, Flight, numbers
+from perch_eval.mcap_log import read
 from perch_eval.nodes import ALL_NODES, executable
 from perch_eval.ros.recorded_flight import RecordedFlight
 from system import forks
@@ -97,6 +98,11 @@ def test_the_page_is_complete(flight):
     assert not re.search(r"\bnan\b|None", re.sub(r'src="[^"]*"', "", page))
 
 
+def test_everything_is_logged_at_a_time_of_the_flight(flight):
+    report, folder = flight
+    assert logged_outside(folder / "flight.mcap", report["simulated_time_s"]) == []
+
+
 @pytest.fixture
 def crowd(ros_domain, tmp_path, monkeypatch) -> Iterator[list[forks.Forked]]:
     """A foreign publisher on every topic, a viewer and two who measure rates, in the domain that the next demo flies in."""
@@ -122,7 +128,7 @@ def crowd(ros_domain, tmp_path, monkeypatch) -> Iterator[list[forks.Forked]]:
 def test_one_process_per_node_in_a_crowd_is_the_same_flight(flight, crowd, tmp_path, monkeypatch):
     """The crowd keeps both cores busy, too. A report is not drawn again."""
     def only_the_hash(out, scenario, seed, outcome, message, wall_time, end_time, start_time):
-        return {"flight_hash": RecordedFlight(out / "flight.mcap").digest(end_time)}
+        return {"flight_hash": RecordedFlight(out / "flight.mcap").digest(end_time), "outside": logged_outside(out / "flight.mcap", end_time)}
 
     report, folder = flight
     monkeypatch.setattr("perch_eval.report.build_report", only_the_hash)
@@ -133,6 +139,8 @@ def test_one_process_per_node_in_a_crowd_is_the_same_flight(flight, crowd, tmp_p
     log = (tmp_path / "logs" / "vehicle.log").read_text()
     for topic in ("trajectory", "controller/command", "motor_command", "odometry", "imu/data_raw"):
         assert log.count(f"[vehicle]: {topic}: /stranger publishes it but is not a participant of the lockstep: ignored") == 1, topic
+    assert log.count("[vehicle]: /clock: /stranger publishes it, too: the clocks of nodes in other processes follow both") == 1
+    assert again["outside"] == []
 
 
 def test_without_ros_and_with_sums_on_two_threads_it_is_the_same_flight(flight):
@@ -145,6 +153,11 @@ def test_without_ros_and_with_sums_on_two_threads_it_is_the_same_flight(flight):
     environment = {**os.environ, **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "2")}
     flown = subprocess.run([sys.executable, "-c", program, SCENARIO, str(SEED)], check=True, capture_output=True, text=True, env=environment)
     assert flown.stdout.strip() == report["flight_hash"]
+
+
+def logged_outside(recording: Path, end_time: float) -> list[tuple[str, float]]:
+    """Messages, with the time at which they are logged [s], outside a flight."""
+    return [(topic, 1e-9 * time) for topic, _, time, _ in read(recording) if not 0 <= time <= 1e9 * (end_time + 1.0)]
 
 
 def first_difference(a: Flight, b: Flight) -> str:

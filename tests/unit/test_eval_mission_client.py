@@ -241,3 +241,20 @@ def test_ctrl_c_ends_the_wait(mission, pilot):
     threading.Thread(target=lambda: (mission.begins.wait(120.0), os.kill(os.getpid(), signal.SIGINT)), daemon=True).start()
     with pytest.raises(KeyboardInterrupt):
         pilot.fly(SCENARIO)
+
+
+def test_a_foreign_clock_does_not_move_time(mission, pilot):
+    """One that shows wall-clock time, before simulation time begins and after."""
+    foreign = topics.topic("/clock").to_message(time.time_ns())
+
+    def passed(duration):
+        until = pilot.time + duration
+        return lambda: mission.clock.publish(foreign) or pilot.time >= until
+
+    pilot.spin_for(0.5)
+    mission.clock.publish(foreign)
+    pilot.spin_for(0.5)
+    assert pilot.time == 0.0
+    mission.passes.set()
+    assert pilot.spin_until(passed(1.0), 60.0) and pilot.spin_until(passed(1.0), 60.0)
+    assert pilot.time < 100.0

@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 from perch_core.ros import topics
-from perch_core.values import NANOSECONDS, CameraImage, ControllerStatus, MotorCommand, OdometryState, Serialized, TrajectoryOrder
+from perch_core.values import NANOSECONDS, CameraImage, ControllerStatus, MotorCommand, OdometryState, Serialized, TargetPose, TrajectoryOrder
 from perch_core.trajectory import rest_to_rest
 from perch_eval.flight import Flight, timed
 from perch_eval.mcap_log import read
@@ -230,3 +230,37 @@ def test_how_it_goes_is_told_once_a_second_of_flight(tmp_path):
     recording.recorder.close()
 
 
+@pytest.mark.parametrize("channel", ["odometry", "/diagnostics"])
+@pytest.mark.parametrize("stamp", [-5 * NANOSECONDS, 2_100_000_000 * NANOSECONDS])
+def test_a_stamp_of_another_clock_moves_no_time(tmp_path, stamp, channel):
+    recording, now = Recording(tmp_path / "f.mcap"), 10 * NANOSECONDS
+    recording.recorder.host_time = lambda: now
+    recording.give("odometry", state(5000))
+    foreign = Diagnostics(stamp) if channel == "/diagnostics" else state(0)._replace(stamp=stamp)
+    recording.give(channel, foreign)
+    recording.give("robot_description", "<robot/>")
+    recording.recorder.close()
+    assert [(topic, time) for topic, _, time, _ in read(recording.path)] == [
+        ("/odometry", now), (f"/{channel.lstrip('/')}", now), ("/robot_description", now)]
+    assert [line.level for line in recording.lines] == ["warning"] * (channel == "odometry")
+
+
+def test_before_there_is_time_stamps_are_and_a_late_message_is_logged_when_it_comes(tmp_path):
+    recording, now = Recording(tmp_path / "f.mcap"), [0]
+    recording.recorder.host_time = lambda: now[0]
+    recording.give("odometry", state(5000))
+    now[0] = 20 * NANOSECONDS
+    recording.give("target/pose", TargetPose(10 * NANOSECONDS, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6)))
+    recording.recorder.close()
+    assert [time for _, _, time, _ in read(recording.path)] == [10 * NANOSECONDS, 20 * NANOSECONDS] and recording.lines == []
+
+
+def test_a_recorder_that_is_started_again_keeps_what_there_is(tmp_path):
+    for name in ("f.mcap", "f.1.mcap", "f.2.mcap"):
+        recording = Recording(tmp_path / "f.mcap")
+        recording.fly(range(10))
+        recording.recorder.close()
+        assert [line.text.endswith(f"recording to {tmp_path / name}") for line in recording.lines] == [
+            True] * (name != "f.mcap")
+        assert len(RecordedFlight(tmp_path / name).values("odometry")) == 10
+    assert len(RecordedFlight(tmp_path / "f.mcap").values("odometry")) == 10

@@ -240,7 +240,7 @@ def test_an_unasked_answer_is_nothing():
 
 
 @pytest.mark.parametrize("goal, word", [
-    ({"mode": 9}, "mode 9"), ({"mode": 2}, "waypoints"), ({"mode": 1, "perch_point": (NAN, 0.0, 0.0)}, "perch_point"),
+    ({"mode": 9}, "mode: 9 is not one of 0 (surface)"), ({"mode": 2}, "waypoints"), ({"mode": 1, "perch_point": (NAN, 0.0, 0.0)}, "perch_point"),
     ({"mode": 1, "perch_pitch": 4.0}, "perch_pitch"), ({"takeoff_height": -1.0}, "takeoff_height"), ({"takeoff_height": math.inf}, "takeoff_height"),
     ({"search_timeout": 0.0}, "search_timeout"), ({"inclination_hint": 9.0}, "inclination_hint"), ({"search_frame": "odom"}, "'odom'"),
     ({"search_frame": "map", "search_position": (NAN, 0.0, 1.0)}, "finite"), ({"search_frame": "map", "search_position": (0.0, 0.0, 0.1)}, "0.3 m"),
@@ -457,3 +457,79 @@ def test_a_controller_that_falls_silent_ends_the_goal_within_a_second_and_a_half
     result = world.run().goal.result
     assert (world.goal.ending, result.error_code) == ("aborted", int(Result.TRACKING_LOST)) and "the controller is silent" in result.message
     assert world.stamp - silent < 1.5 * NANOSECONDS
+
+
+# -- hung nodes --------------------------------------------------------------------------------------------------------
+
+
+def overdue(world, within=5.0):
+    """What the feedback names within a time [s] from now."""
+    before = len(world.goal.told)
+    for _ in range(round(within / 0.02)):
+        if world.goal.ending is None:
+            world.tick()
+    return " | ".join(dict.fromkeys(f.message for f in world.goal.told[before:]))
+
+
+def never(world, *names):
+    """From now on, the named inputs of the mission do not come."""
+    for name in names:
+        setattr(world.mission, f"on_{name}", lambda value: None)
+    return world
+
+
+@pytest.mark.parametrize("silent, owed", [
+    (["imu", "odometry", "estimator", "status"], "no imu/data_raw from vehicle, no odometry from estimator, no estimator/status from estimator, "
+                                                 "no controller/status from controller for 3 s"),
+    (["odometry", "estimator"], "no odometry from estimator, no estimator/status from estimator for 3 s"), (["odometry"], "no odometry from estimator for 3 s"),
+    (["estimator"], "no estimator/status from estimator for 3 s"),
+    (["status"], "no controller/status from controller for 3 s")])
+def test_before_the_take_off_what_is_awaited_is_named_in_feedback_and_result(silent, owed):
+    world = never(World(), *silent).send()
+    assert owed in overdue(world) and world.phase == "arming"
+    world.run()
+    assert world.goal.result.error_code == Result.TIMEOUT and owed in world.goal.result.message
+
+
+def test_an_estimator_that_waits_for_vio_owes_nothing_itself():
+    world, receive = World(), Mission.on_estimator
+    world.odometry = False
+    world.mission.on_estimator = lambda health: receive(world.mission, health._replace(state=0, vio_age=math.inf))
+    assert "no odometry from estimator, no vio/odometry from vio for 3 s" in overdue(world.send())
+
+
+@pytest.mark.parametrize("silent, owed", [
+    (["imu"], "no imu/data_raw from vehicle, "), (["odometry"], "no odometry from estimator, "), (["estimator"], "no estimator/status from estimator, "),
+    ([], "")])
+def test_in_flight_what_has_stopped_is_named(silent, owed):
+    world = never(World(), "target").send().run(until=lambda w: w.phase == "searching")
+    assert f"(no tags detected); {owed}no target/pose from target_localizer for 3 s" in overdue(never(world, *silent))
+
+
+def test_a_map_that_does_not_come_is_named():
+    world = never(Wires(), "powerlines").send().run(until=lambda w: w.phase == "searching")
+    assert "no powerlines from powerline_mapper for 3 s" in overdue(world)
+
+
+@pytest.mark.parametrize("world, owed", [(World, "no plan_perch from perching_planner for 3 s"), (Wires, "no plan_powerline from powerline_planner for 3 s")])
+def test_a_planner_that_does_not_answer_is_named(world, owed):
+    world = world(planner=lambda request: None) if world is World else world()
+    world.planner = lambda request: None
+    world.send().run(until=lambda w: w.phase == "planning")
+    assert f"planning; {owed}" in overdue(world)
+    world.run()
+    assert world.goal.result.error_code == Result.TIMEOUT and owed in world.goal.result.message
+
+
+@pytest.mark.parametrize("phase", ["", "searching"])
+def test_where_simulated_time_stands_still_the_vehicle_is_named(phase):
+    world = World() if phase else never(World(), "imu", "odometry", "estimator", "status")
+    world.send().run(until=lambda w: w.phase == phase)
+    for _ in range(250):
+        world.mission.on_tick(world.clock)
+    assert "no /clock from vehicle" in world.goal.told[-1].message and "no odometry from estimator" in world.goal.told[-1].message
+
+
+def test_a_flight_in_which_everything_comes_names_nothing():
+    world = World().send().run()
+    assert not [f for f in world.goal.told if "from" in f.message] and world.goal.result.message == "perched"

@@ -1,16 +1,21 @@
 """Simulation time between nodes of one process."""
 
+import time
 from dataclasses import dataclass
 
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
+from builtin_interfaces.msg import Time  # noqa: E402
 from perch_core.component import Component, Output  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
-from perch_core.ros.node import close_nodes  # noqa: E402
+from perch_core.ros.node import close_nodes, connect  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
+from rclpy.experimental import EventsExecutor  # noqa: E402
+from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -52,4 +57,28 @@ def test_time_of_a_clock_in_the_process_is_known_at_once_and_without_a_subscript
         assert ("/clock" in topics) is not together
         assert listening.get_clock().now().nanoseconds == (7_000_000_123 if together else 0)
     finally:
+        close_nodes([listening, ticking])
+
+
+def test_a_negative_time_is_ignored_and_other_clocks_are_named(context, monkeypatch):
+    """rclpy would raise an exception in the executor, and the process would end."""
+    simulated = [Parameter("use_sim_time", value=True)]
+    listening = ArrivalNode("listening", Listening, Wiring(), context=context, parameter_overrides=simulated)
+    ticking = ArrivalNode("ticking", Ticking, Wiring(), context=context)
+    foreign, executor = Node("foreign", context=context), EventsExecutor(context=context)
+    clock = foreign.create_publisher(Clock, "/clock", 1)
+    said = []
+    monkeypatch.setattr(ticking, "warn_once", said.append)
+    try:
+        connect([listening, ticking], executor)
+        end = time.monotonic() + 60.0
+        while not (said and listening.get_clock().now().nanoseconds == 7_000_000_000):
+            assert time.monotonic() < end
+            for sec in (-5, 7):
+                clock.publish(Clock(clock=Time(sec=sec)))
+                executor.spin_once(timeout_sec=0.1)
+        assert said[0] == "/clock: /foreign publishes it, too: the clocks of nodes in other processes follow both"
+    finally:
+        executor.shutdown()
+        foreign.destroy_node()
         close_nodes([listening, ticking])

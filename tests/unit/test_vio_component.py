@@ -9,7 +9,7 @@ import pytest
 from perch_core import so3
 from perch_core.camera import RadialTangentialCamera
 from perch_core.config import from_mapping
-from perch_core.values import CameraImage, CameraModel, ImuSample, InertialState, Transform
+from perch_core.values import CameraImage, CameraModel, ImuSample, InertialState, OdometryState, Transform
 from perch_core.vehicle import load_vehicle
 from perch_eval.estimation_flight import motion_of
 from perch_eval.perch_motion import read_imu
@@ -201,3 +201,45 @@ def test_vio_and_estimator_together_at_200_hz():
     assert np.linalg.norm(np.array(last.p_WB) - truth.p_WB[0]) < 0.06
     assert np.diff([o.stamp for o in out["odometry"]]).tolist() == [5_000_000] * (len(out["odometry"]) - 1)
     assert out["status"][-1].state == 1
+
+
+TURN, SHIFT = so3.exp(np.array([0.0, 0.0, 0.7])), np.array([5.0, -3.0, 20.0])
+POSE_SIGMA = np.array([0.3, 0.2, 0.1, 0.01, 0.01, 0.05])
+
+
+def elsewhere(stamp, truth):
+    """Odometry of an estimator for which the vehicle is at another place, with another heading."""
+    q = tuple(so3.quat_from_matrix(TURN @ truth.R_WB[0]))
+    return OdometryState(stamp, tuple(TURN @ truth.p_WB[0] + SHIFT), q, tuple(truth.R_WB[0].T @ truth.v_WB[0]), (0.0, 0.0, 0.0),
+                         np.diag(POSE_SIGMA**2), 0.01 * np.eye(6), "map")
+
+
+def joined(begin, until, tamper=lambda flight, odometry: odometry):
+    """A VIO that is started at a time of the flight; `tamper` changes the odometry."""
+    flight = Flight()
+    flight.samples = [sample for sample in flight.samples if sample.stamp >= begin * 1e9]
+    flight.waiting = [frame for frame in flight.waiting if frame[0] >= begin * 1e9]
+    for stamp in [sample.stamp for sample in flight.samples if sample.stamp < until * 1e9]:
+        odometry = elsewhere(stamp, flight.motion.sample(np.array([stamp * 1e-9])))
+        flight.component.on_estimate(tamper(flight, odometry))
+        flight.fly((stamp + 1) * 1e-9)
+    return flight
+
+
+@pytest.mark.parametrize("begin", [1.0, 2.0])
+def test_started_late_it_continues_the_odometry_and_ignores_it_from_then_on(begin):
+    """On the floor, and in the climb."""
+    flight = joined(begin, 3.4, lambda flight, odometry: odometry._replace(p_WB=(9e2, 9e2, 9e2)) if flight.out["state"] else odometry)
+    assert len(flight.out["state"]) > 8
+    for state in flight.out["state"]:
+        truth = flight.motion.sample(np.array([state.stamp * 1e-9]))
+        assert np.linalg.norm(state.p_WB - TURN @ truth.p_WB[0] - SHIFT) < 0.06
+        assert np.linalg.norm(so3.log((TURN @ truth.R_WB[0]).T @ so3.quat_to_matrix(state.q_WB))) < 0.03
+    sigma = np.sqrt(np.diag(flight.out["odometry"][0].pose_covariance))
+    np.testing.assert_allclose(sigma[[0, 1, 2, 5]], POSE_SIGMA[[0, 1, 2, 5]], rtol=0.1)
+
+
+@pytest.mark.parametrize("change", [dict(frame="camera_link"), dict(pose_covariance=-np.eye(6)), dict(stamp=10)])
+def test_odometry_that_cannot_be_used_leaves_the_configured_start(change):
+    flight = joined(1.0, 1.4, lambda flight, odometry: odometry._replace(**change))
+    assert flight.error(flight.out["state"][-1])[0] < 0.05

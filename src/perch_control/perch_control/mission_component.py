@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -15,6 +15,7 @@ from perch_core.values import (
     NANOSECONDS, AtEnd, ControllerCommand, ControllerStatus, EstimatorHealth, ImuSample, OdometryState, PerchFeedback, PerchGoal, PerchPlan,
     PerchPlanRequest, PerchResult, PowerlineMap, PowerlinePlan, PowerlinePlanRequest, TargetPose, TrajectoryOrder, Transform,
     TriggerRequest, TriggerResponse, nanoseconds, seconds)
+from perch_control.mission.awaited import awaited, overdue, overdue_at_start
 from perch_control.mission.departure import Departure
 from perch_control.mission.goals import goal_of, problem_with
 from perch_control.mission.machine import MissionMachine
@@ -23,54 +24,19 @@ from perch_control.mission.moves import Moves
 from perch_control.mission.parameters import MissionParameters
 from perch_control.mission.pending_requests import PendingRequest, Requests
 from perch_control.mission.requests import flown_order, perch_request, plan_answer, powerline_request
+from perch_control.mission.running_goal import DepartureGoal, RunningGoal
 from perch_control.mission.targets import Targets
-from perch_control.mission.values import TICK, ControllerState, Inputs, Mode, Outcome, Outputs, PlanQuery, Result, State
+from perch_control.mission.values import TICK, ControllerState, Inputs, Outcome, Outputs, Phase, PlanQuery, Result, State
 from perch_control.period import MeasuredPeriod
 from perch_control.stamp_guard import Stamp, StampGuard
 
 FEEDBACK_PERIOD = NANOSECONDS // 10  # where nothing changes [ns]
 ODOMETRY_TIMEOUT = NANOSECONDS // 2  # without odometry for so long, the host's time is used instead [ns]
+TICK_NS = nanoseconds(TICK)          # [ns]
 STALE = NANOSECONDS                  # age at which a message is no longer current [ns]
 RUNNING = 1                          # perch_msgs/EstimatorStatus
 IMU_SAMPLES_MAX = 4000               # samples between two ticks that are kept
 _ENDINGS = {Result.PERCHED: "succeeded", Result.CANCELLED: "cancelled"}
-
-
-@dataclass
-class _Running:
-    """A goal in progress.
-
-    Attributes:
-        goal: as passed by the host.
-        machine: state machine that executes the goal.
-        started: whether the machine has been started.
-        waiting_since: host time since which the goal waits for odometry [ns].
-        pending: the latest request to the planner, until its answer is used.
-        way_out: the same, for a way out of a perch on a surface.
-    """
-
-    goal: Goal
-    machine: MissionMachine
-    started: bool = False
-    waiting_since: int | None = None
-    pending: PendingRequest | None = None
-    way_out: PendingRequest | None = None
-
-
-class _Departing:
-    """A departure with the interface of a goal; its end answers the service request."""
-
-    value, cancel_requested = PerchGoal(mode=Mode.POWERLINE), False  # requests go to the planner for wires
-
-    def __init__(self, reply: Callable[[TriggerResponse], None]) -> None:
-        self._reply = reply
-
-    def feedback(self, value: PerchFeedback) -> None:
-        """Do nothing: the service has no feedback."""
-
-    def finish(self, ending: str, result: PerchResult) -> None:
-        """Answer the request."""
-        self._reply(TriggerResponse(result.success, result.message))
 
 
 class Mission(Component[MissionParameters]):
@@ -104,7 +70,7 @@ class Mission(Component[MissionParameters]):
         super().__init__(config)
         self._axes = ImuAxes(self.warn, config.sensors)
         self._ids = count(1)  # the controller distinguishes trajectories by them: they are unique across goals
-        self._running: _Running | None = None
+        self._running: RunningGoal | None = None
         self._begin()
 
     def _begin(self) -> None:
@@ -113,11 +79,13 @@ class Mission(Component[MissionParameters]):
         self._moves = Moves(self.config.mission)  # `home` is kept from goal to goal
         self._forces: deque[tuple[float, ...]] = deque(maxlen=IMU_SAMPLES_MAX)
         self._odometry: OdometryState | None = None
+        self._newest_imu: int | None = None  # stamp of the newest IMU sample [ns]
         self._targets = Targets()
         self._status: ControllerStatus | None = None
         self._estimator: EstimatorHealth | None = None
         self._requests = {channel: Requests() for channel in ("plan_perch", "plan_way_out", "plan_powerline")}
         self._last_odometry_stamp = self._last_odometry_time = -1  # odometry of the last tick, and the host's time then [ns]
+        self._idle_ticks = 0  # since the newest odometry or the goal; they are regular although simulated time may stand still
         self._last_feedback = (-FEEDBACK_PERIOD, "", "")  # the last feedback: stamp [ns], phase, message
         self._diagnosed: int | None = None
 
@@ -139,6 +107,7 @@ class Mission(Component[MissionParameters]):
         if taken is not None and self._stamp_accepted(sample.stamp, "imu/data_raw"):
             self._imu_period.update(seconds(sample.stamp))
             self._forces.append(taken.f_B)
+            self._newest_imu = sample.stamp
 
     def on_odometry(self, state: OdometryState) -> None:
         """Keep the newest odometry."""
@@ -197,35 +166,40 @@ class Mission(Component[MissionParameters]):
 
     def on_tick(self, now: int) -> None:
         """Decide where there is newer odometry than at the last tick, or none for `ODOMETRY_TIMEOUT`."""
+        self._idle_ticks += 1
         if self._odometry is None:
             if self._running is not None:
                 self._wait_for_odometry(self._running, now)
             return
         stamp = self._odometry.stamp
         if stamp != self._last_odometry_stamp or now < self._last_odometry_time:
-            self._last_odometry_stamp, self._last_odometry_time = stamp, now
+            self._last_odometry_stamp, self._last_odometry_time, self._idle_ticks = stamp, now, 0
         elif now - self._last_odometry_time >= ODOMETRY_TIMEOUT:
             stamp += now - self._last_odometry_time
         else:
+            if self._running is not None and (text := overdue(self._idle_ticks * TICK_NS, 0, {"/clock": None, "odometry": None})):
+                self._running.overdue = text
+                self._publish_feedback(self._running, stamp)
             return
         if self._running is not None:
             self._decide(self._running, stamp, self._odometry)
         self._forces.clear()
         if self._diagnosed is None or stamp - self._diagnosed >= NANOSECONDS:
             self._diagnosed = stamp
-            machine = self._running.machine if self._running is not None else None
-            phase, message = (machine.phase.value, machine.message) if machine is not None else ("idle", "no goal")
+            phase, message = ("idle", "no goal") if self._running is None else (self._running.machine.phase.value, self._running.message)
             self.diagnostics(Diagnostics(stamp, {"phase": phase}, 0, message))
 
-    def _wait_for_odometry(self, running: _Running, now: int) -> None:
+    def _wait_for_odometry(self, running: RunningGoal, now: int) -> None:
         if running.waiting_since is None or now < running.waiting_since:
             running.waiting_since = now
+        running.overdue = overdue_at_start(now - running.waiting_since, self._idle_ticks * TICK_NS, self._newest(running))
+        self._publish_feedback(running, now)
         if running.goal.cancel_requested:
             self._finish(running, 0, Outcome(Result.CANCELLED, "cancelled on the ground"))
         elif now - running.waiting_since > nanoseconds(self.config.mission.arming_timeout):
             self._finish(running, 0, Outcome(Result.TIMEOUT, f"no odometry within {self.config.mission.arming_timeout:g} s"))
 
-    def _decide(self, running: _Running, stamp: int, odometry: OdometryState) -> None:
+    def _decide(self, running: RunningGoal, stamp: int, odometry: OdometryState) -> None:
         status = self._status
         if status is not None and odometry.stamp - status.stamp > STALE:  # it answers every sample, whatever its state
             self._finish(running, stamp, Outcome(Result.TRACKING_LOST, f"the controller is silent: no controller/status for {seconds(STALE):g} s"))
@@ -235,6 +209,7 @@ class Mission(Component[MissionParameters]):
             running.started = True
             running.machine.start(goal_of(running.goal.value, self.config.mission), time)
         plan, way_out = running.pending, running.way_out
+        running.overdue = overdue(stamp, nanoseconds(running.machine.since), self._newest(running))
         inputs = self._inputs(running, time, odometry)
         if plan is not None and stamp >= plan.due and plan.answer is not None:
             running.pending, inputs = None, replace(inputs, plan=plan_answer(plan.answer))
@@ -242,7 +217,7 @@ class Mission(Component[MissionParameters]):
             running.way_out, inputs = None, replace(inputs, way_out=plan_answer(way_out.answer))
         self._act(running, stamp, running.machine.tick(inputs))
 
-    def _inputs(self, running: _Running, time: float, x: OdometryState) -> Inputs:
+    def _inputs(self, running: RunningGoal, time: float, x: OdometryState) -> Inputs:
         status, estimator = self._status, self._estimator
         state = State(np.array(x.p_WB), np.array(x.q_WB), np.array(x.v_WB), np.array(x.w_B))
         return Inputs(
@@ -254,7 +229,10 @@ class Mission(Component[MissionParameters]):
             specific_force_B=np.array(self._forces).reshape(-1, 3),
             cancel=running.goal.cancel_requested, imu_period=self._imu_period.value)
 
-    def _act(self, running: _Running, stamp: int, outputs: Outputs) -> None:
+    def _newest(self, running: RunningGoal) -> dict[str, int | None]:
+        return awaited(running, self._newest_imu, self._odometry, self._estimator, self._status, self._targets)
+
+    def _act(self, running: RunningGoal, stamp: int, outputs: Outputs) -> None:
         for command, reason in outputs.commands:
             self.command(ControllerCommand(stamp, int(command), reason))
         if outputs.reference is not None:
@@ -272,22 +250,22 @@ class Mission(Component[MissionParameters]):
         if outputs.outcome is not None:
             self._finish(running, stamp, outputs.outcome)
 
-    def _publish_feedback(self, running: _Running, stamp: int) -> None:
+    def _publish_feedback(self, running: RunningGoal, stamp: int) -> None:
         """Publish the goal's feedback at every change, and every `FEEDBACK_PERIOD`."""
-        machine = running.machine
-        content = (machine.phase.value, machine.message)
-        if content == self._last_feedback[1:] and stamp - self._last_feedback[0] < FEEDBACK_PERIOD:
+        phase = running.machine.phase if running.started else Phase.ARMING
+        content = (phase.value, running.message)
+        if content == self._last_feedback[1:] and 0 <= stamp - self._last_feedback[0] < FEEDBACK_PERIOD:
             return
         self._last_feedback = (stamp, *content)
-        running.goal.feedback(PerchFeedback(machine.phase.value, machine.phase.progress, float(machine.time_to_contact), machine.message))
+        running.goal.feedback(PerchFeedback(content[0], phase.progress, float(running.machine.time_to_contact), content[1]))
 
     # -- planners ----------------------------------------------------------------------------------------------------
 
-    def _request_plan(self, running: _Running, stamp: int, query: PlanQuery) -> PendingRequest:
-        surface = running.goal.value.mode == Mode.SURFACE
+    def _request_plan(self, running: RunningGoal, stamp: int, query: PlanQuery) -> PendingRequest:
+        surface = not query.target.lines
         channel = "plan_powerline" if not surface else "plan_way_out" if query.recovery else "plan_perch"
         start = seconds(nanoseconds(query.start_time))
-        request = self._requests[channel].add(PendingRequest(stamp, stamp + nanoseconds(query.latency), start))
+        request = self._requests[channel].add(PendingRequest(channel, stamp, stamp + nanoseconds(query.latency), start))
         ratio = self._status.thrust_ratio if self._status is not None else 0.0
         getattr(self, channel)(perch_request(query, ratio) if surface else powerline_request(query), request.due)
         return request
@@ -324,14 +302,15 @@ class Mission(Component[MissionParameters]):
         if self._running is not None:
             reply(TriggerResponse(False, "a goal is being flown"))
         else:
-            self._take(_Departing(reply), Departure)
+            self._take(DepartureGoal(reply), Departure)
 
     def _take(self, goal: Goal, kind: type[MissionMachine]) -> None:
-        self._running = _Running(goal, kind(self.config.mission, self._ids, self._moves))
+        self._running, self._idle_ticks = RunningGoal(goal, kind(self.config.mission, self._ids, self._moves)), 0
 
-    def _finish(self, running: _Running, stamp: int, outcome: Outcome) -> None:
-        self.info(f"{outcome.result.name.lower()}: {outcome.message}")
+    def _finish(self, running: RunningGoal, stamp: int, outcome: Outcome) -> None:
+        message = running.with_overdue(outcome.message) if outcome.result is not Result.PERCHED else outcome.message
+        self.info(f"{outcome.result.name.lower()}: {message}")
         self._running, x = None, self._odometry
         pose = {} if x is None else {"final_position": tuple(x.p_WB), "final_attitude": tuple(x.q_WB)}
         running.goal.finish(_ENDINGS.get(outcome.result, "aborted"), PerchResult(
-            outcome.result is Result.PERCHED, int(outcome.result), outcome.message, float(outcome.contact_time), seconds(stamp), **pose))
+            outcome.result is Result.PERCHED, int(outcome.result), message, float(outcome.contact_time), seconds(stamp), **pose))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from perch_control.mission.missions import mission_class, mode_of
 from perch_core import config
 from perch_core.errors import ConfigError
 from perch_core.tag_board import load_board
@@ -25,13 +26,17 @@ def check_names(scenario: Scenario, source: str | Path) -> Vehicle:
         source: its file, for messages.
 
     Raises:
-        ConfigError: no such vehicle or tag board, or one of these files is refused.
+        ConfigError: no such vehicle, tag board or mission, or one of the files is refused.
     """
     for key, kind, name in (("vehicle", "vehicles", scenario.vehicle), ("target.board", "boards", scenario.target.board)):
         try:
             config.find(kind, name)
         except ConfigError as error:
             raise ConfigError(str(source), key, f"{name!r}: {error.problem}") from None
+    try:
+        mission_class(mode_of(scenario.mission_type))
+    except ConfigError as error:
+        raise ConfigError(str(source), error.key, error.problem) from None
     load_board(scenario.target.board)
     return load_vehicle(scenario.vehicle)
 

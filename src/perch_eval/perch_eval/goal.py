@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from perch_control.mission.values import Mode, Result
+from perch_control.mission.missions import mode_of
+from perch_control.mission.values import Result
 from perch_core.values import PerchGoal
 from perch_sim.scenario import Scenario
 
@@ -15,12 +16,16 @@ SUCCESSES = ("perched", "inspected")
 
 
 def goal_of(scenario: Scenario) -> PerchGoal:
-    """Return the goal that a scenario's mission section describes."""
+    """Return the goal that a scenario's mission section describes.
+
+    Raises:
+        ConfigError: there is no such mission.
+    """
     mission = scenario.mission
-    points = {"powerline": mission.perch_point, "inspection": scenario.inspection.watched}
+    point = scenario.inspection.watched if scenario.mode == "inspection" else mission.perch_point
     return PerchGoal(
-        mode=int(Mode[scenario.mode.upper()]), takeoff_height=mission.takeoff_height, search_timeout=mission.search_timeout,
-        perch_point=tuple(points.get(scenario.mode, (0.0, 0.0, 0.0))), perch_pitch=math.radians(mission.perch_pitch_deg),
+        mode=mode_of(scenario.mission_type), takeoff_height=mission.takeoff_height, search_timeout=mission.search_timeout,
+        perch_point=tuple(point), perch_pitch=math.radians(mission.perch_pitch_deg),
         perception_aware=mission.perception_aware, replan=mission.replan, attempts=mission.attempts)
 
 

@@ -165,9 +165,10 @@ def parse_overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def _host_parameters(node: str, lockstep: bool) -> dict[str, Any]:
-    """Return a node's host parameters in simulation. Time is that of `/clock`, which the vehicle publishes, also in real time."""
+    """Return a node's host parameters in simulation. Time is that of `/clock`, which the vehicle publishes, also in real time,
+    where the wall clock paces the vehicle itself."""
     if node == "vehicle":
-        return {"lockstep": lockstep, "use_sim_time": False}
+        return {"lockstep": lockstep, "use_sim_time": lockstep}
     return {"lockstep": lockstep, "use_sim_time": True} if node in PARTICIPANTS else {"use_sim_time": True}
 
 

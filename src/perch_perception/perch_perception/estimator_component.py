@@ -123,7 +123,7 @@ class StateEstimator(Component[EstimatorConfig]):
             if not is_odometry and (outcome.used or outcome is VioOutcome.DUPLICATE):
                 self._newest_state = stamp
             self._covariance_age = COVARIANCE_STRIDE
-            if not outcome.used and outcome not in (VioOutcome.WAITING, VioOutcome.NO_IMU):
+            if outcome not in (VioOutcome.STARTED, VioOutcome.APPLIED, VioOutcome.WAITING, VioOutcome.NO_IMU):
                 self.warn(f"{'vio/odometry' if is_odometry else 'vio/state'}: at {stamp} ns {outcome.value}", 1.0)
 
     def _emit(self, stamp: int, e: Estimate) -> None:

@@ -18,7 +18,7 @@ from perch_perception.sensor_file import calibration_sigmas, imu_noise, sensors_
 from perch_perception.ukf.odometry import covariances
 from perch_perception.vio import FrameOutcome, VioConfig, VioPoseEstimate, VioResult, VisualInertialOdometry
 from perch_perception.vio.drawing import TrackPainter
-from perch_perception.world_frames import ODOM
+from perch_perception.world_frames import ODOM, is_world
 
 DIAGNOSTICS_PERIOD = 1_000_000_000  # [ns]
 
@@ -48,6 +48,7 @@ class VioComponent(CameraComponent[VioComponentConfig]):
     config_type = VioComponentConfig
 
     imu = Input(ImuSample, "imu/data_raw", lazy=True)
+    estimate = Input(OdometryState, "odometry", lazy=True)
     state = Output(InertialState, "vio/state")
     odometry = Output(OdometryState, "vio/odometry")
     debug_image = Output(CameraImage, "vio/debug_image")
@@ -94,6 +95,13 @@ class VioComponent(CameraComponent[VioComponentConfig]):
             self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
         if self._queue:
             self.advance()
+
+    def on_estimate(self, odometry: OdometryState) -> None:
+        """Take the estimator's odometry, whose pose a VIO that is started in flight continues."""
+        if is_world(odometry.frame):
+            self._vio.add_odometry(odometry)
+        else:
+            self.warn(f"odometry: frame {odometry.frame!r} is not a known fixed frame: ignored", 1.0)
 
     def is_ready(self, image: CameraImage) -> bool:
         """Whether the IMU has passed the image's exposure, or its stamp is too far ahead to wait for."""

@@ -159,16 +159,15 @@ class Search:
         Longer durations only are reached from each, and the shortest that admit a plan may be missed: which plans violate limits
         depends on the ratio of the segments, too.
         """
-        first = None
+        found = []
         for factor, programs in STARTS:
             self._iterations_end = min(self.iterations + programs, self._iterations_max)
-            found = self._run_from(with_last_segment(factor * self.initial_durations, self.settings))
-            if found[1].proved:
-                return found
-            first = first or found
+            found.append(self._run_from(with_last_segment(factor * self.initial_durations, self.settings)))
+            if found[-1][1].proved:
+                return found[-1]
             if self.iterations >= self._iterations_max:
                 break
-        return first
+        return found[0]
 
     def _run_from(self, durations: np.ndarray) -> tuple[np.ndarray, Outcome]:
         """Lengthen durations until every limit is proved, or the time or the number of programs is exhausted. [M:IV-C.3]

@@ -141,6 +141,7 @@ class Latency:
 class Mission:
     """The goal of the Perch action that a demo sends."""
 
+    type: str = text("", doc="mission, one of perch_control.mission.missions; empty: that of the scenario's mode")
     takeoff_height: float = quantity(1.2, unit="m", above=0.0, high=10.0)
     search_timeout: float = quantity(10.0, unit="s", above=0.0, high=300.0, doc="the target is looked for so long")
     replan: bool = quantity(False)
@@ -244,6 +245,11 @@ class Scenario:
             raise ConfigError("", "target.height", f"pad is {reach:.2f} m from the search hover, outside [0.8, 3.6] m that the camera reads")
         if 90.0 < self.target.inclination_deg and self.target.height < self.mission.takeoff_height:
             raise ConfigError("", "target.height", f"{self.target.height:g} m is below the search hover; a ceiling pad must be above it")
+
+    @property
+    def mission_type(self) -> str:
+        """Name of the mission that is flown."""
+        return self.mission.type or self.mode
 
     @property
     def heading(self) -> float:

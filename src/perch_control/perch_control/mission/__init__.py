@@ -6,9 +6,9 @@ from perch_control.mission.machine import MissionMachine
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.surface import SurfaceMission
 from perch_control.mission.values import (
-    Command, ControllerState, Goal, Inputs, Mode, Outcome, Outputs, Phase, Plan, PlanQuery, Refusal, Result, State, Target)
+    Command, ControllerState, Goal, Inputs, Outcome, Outputs, Phase, Plan, PlanQuery, Refusal, Result, State, Target)
 from perch_control.mission.wire import PowerlineMission
 
 __all__ = ["AdhesionMonitor", "Command", "ControllerState", "Goal", "InspectionMission", "Inputs", "MissionMachine",
-           "MissionSettings", "Mode", "Outcome", "Outputs", "Phase", "Plan", "PlanQuery", "PowerlineMission", "Refusal", "Result", "State",
+           "MissionSettings", "Outcome", "Outputs", "Phase", "Plan", "PlanQuery", "PowerlineMission", "Refusal", "Result", "State",
            "SurfaceMission", "Target"]

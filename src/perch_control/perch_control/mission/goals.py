@@ -8,17 +8,19 @@ from dataclasses import replace
 import numpy as np
 
 from perch_core import so3
+from perch_core.errors import ConfigError
 from perch_core.values import PerchGoal, limits
-from perch_control.mission.missions import MISSIONS, known_modes, mission_class
+from perch_control.mission.missions import mission_class
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Goal
 
 
 def problem_with(goal: PerchGoal, settings: MissionSettings) -> str:
     """Return why a goal cannot be flown; empty: it can."""
-    if goal.mode not in MISSIONS:
-        return f"mode {goal.mode} is none of {known_modes()}"
-    problem = mission_class(goal.mode).problem(goal, settings)
+    try:
+        problem = mission_class(goal.mode).problem(goal, settings)
+    except ConfigError as error:
+        return str(error)
     if problem:
         return problem
     if goal.search_frame and goal.search_frame != "map":

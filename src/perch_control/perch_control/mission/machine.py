@@ -31,12 +31,15 @@ class MissionMachine(ABC):
 
     Attributes:
         phase, message, time_to_contact: as in the feedback.
+        since: when the phase began [s].
         phases: handler of each phase.
     """
 
     _goal: Goal  # from `start` on
     no_target_message = "no target detected"
     """Message while no target is detected."""
+    target_channel = "target/pose"
+    """Channel of the target: this one, or `powerlines`."""
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         """
@@ -53,7 +56,7 @@ class MissionMachine(ABC):
             Phase.ARMING: self._arming, Phase.TAKE_OFF: self._take_off, Phase.SEARCHING: self._searching,
             Phase.RECOVERING: self._recovering}
         self._adhesion = AdhesionMonitor()
-        self._since = self._entered_search = 0.0
+        self.since = self._entered_search = 0.0
         self._target_since: float | None = None
         self._requested_at: float | None = None  # when arming, or a way out from a wire, was requested last [s]
         self._ids = count(1) if ids is None else ids
@@ -292,14 +295,14 @@ class MissionMachine(ABC):
         self.phase, self.message = Phase.IDLE, message
 
     def _enter(self, phase: Phase, time: float, message: str) -> None:
-        self.phase, self.message, self._since = phase, message, time
+        self.phase, self.message, self.since = phase, message, time
         if phase is Phase.ARMING:
             self._requested_at, self._entered_search = None, time
         if phase is Phase.SEARCHING:
             self._target_since, self._moves.places_visited, self._entered_search = None, 0, time
 
     def _elapsed(self, inputs: Inputs) -> float:
-        return inputs.time - self._since
+        return inputs.time - self.since
 
     def _new_id(self) -> int:
         return next(self._ids)

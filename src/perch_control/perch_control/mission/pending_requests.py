@@ -13,8 +13,9 @@ Answer = PerchPlan | PowerlinePlan | Unavailable
 
 @dataclass
 class PendingRequest:
-    """A pending request: when it was made and from when its answer is used [ns], the plan's start [s], the answer."""
+    """A pending request: its service, when it was made and from when its answer is used [ns], the plan's start [s], the answer."""
 
+    channel: str
     made: int
     due: int
     start: float

@@ -23,6 +23,11 @@ class Targets:
         self._pad: tuple[TargetPose, np.ndarray] | None = None  # and the covariance of the odometry when it came, shape (6, 6)
         self.lines: PowerlineMap | None = None
 
+    def newest(self, channel: str) -> int | None:
+        """Return the stamp of the newest value of `target/pose` or `powerlines` [ns]; None: there was none."""
+        value = self.lines if channel == "powerlines" else None if self._pad is None else self._pad[0]
+        return None if value is None else value.stamp
+
     def take_pad(self, pose: TargetPose, x: OdometryState | None, newest: int) -> str:
         """Keep a pose of the pad, or return why it is refused.
 

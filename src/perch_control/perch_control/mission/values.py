@@ -52,14 +52,6 @@ class Result(IntEnum):
     PERCHED_ALREADY = 9
 
 
-class Mode(IntEnum):
-    """Missions provided by perch_control: MODE_* of the Perch action. See `perch_control.mission.missions`."""
-
-    SURFACE = 0
-    POWERLINE = 1
-    INSPECTION = 2
-
-
 @dataclass(frozen=True)
 class State:
     """Estimated state of the vehicle.

@@ -20,6 +20,7 @@ class LineMission(MissionMachine):
     """Mission at a mapped powerline: the lines are observed from several places."""
 
     no_target_message = "no line mapped near the goal's point, or a vertical one"
+    target_channel = "powerlines"
 
     def target(self, pad: Target | None, lines: PowerlineMap | None, p_WB: np.ndarray) -> Target | None:
         """Return the target on the mapped line that the goal refers to."""

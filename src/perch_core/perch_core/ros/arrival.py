@@ -51,14 +51,8 @@ class ArrivalNode(ComponentNode):
             self.create_timer(CHECK_PERIOD, self._warn_foreign_publishers, clock=self._steady)
 
     def _create_component_timer(self, port: Timer) -> None:
-        handler, clock = partial(self.guarded, port.name, port.handler(self.component)), self.get_clock().handle
-
-        def call() -> None:
-            with clock:
-                now = clock.get_now().nanoseconds  # as `Clock.now` has it, without an object of the time: this runs at 500 Hz
-            self._intake.enter(handler, now)
-
-        self.create_timer(port.period, call, clock=self._steady)
+        handler = partial(self.guarded, port.name, port.handler(self.component))
+        self.create_timer(port.period, lambda: self._intake.enter(handler, self.host_time()), clock=self._steady)
 
     def _warn_foreign_publishers(self) -> None:
         """Warn once of each foreign publisher on a topic that a neighbour publishes: its messages are ignored."""

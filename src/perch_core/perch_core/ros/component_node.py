@@ -25,7 +25,7 @@ from perch_core.ros.jobs import Jobs
 from perch_core.ros.late_service import LateService
 from perch_core.ros.messages.diagnostics import diagnostics_message
 from perch_core.ros.parameters import Parameters
-from perch_core.ros.wiring import Publication, Wiring
+from perch_core.ros.wiring import Publication, Wiring, foreign_publishers
 from rclpy.action import GoalResponse
 from rclpy.clock import Clock, ClockType
 from rcl_interfaces.msg import SetParametersResult
@@ -39,6 +39,7 @@ INTERNAL_OUTPUTS = ("log", "diagnostics")  # outputs that are no topics of their
 DURATIONS_KEPT = 300    # calls whose durations are kept
 LOG_KINDS_MAX = 100     # kinds of lines whose times are kept
 HEARTBEAT_PERIOD = 1.0  # of the diagnostics of a node whose component emits none [s]
+CLOCK_CHECK_PERIOD = 1.0  # of the check for other publishers of the clock that this node publishes [s]
 LOG_LENGTH_MAX = 300    # characters of a log line below the level error
 _NUMBERS = re.compile(r"[-+.\de]*\d")  # what differs between lines of one kind
 
@@ -71,8 +72,9 @@ class ComponentNode(Node):
         except ConfigError:
             self.destroy_node()
             raise
-        if hasattr(self.component, "resolve"):
-            self.component.resolve = self.resolve_topic_name
+        for attribute, function in (("resolve", self.resolve_topic_name), ("host_time", self.host_time)):
+            if hasattr(self.component, attribute):
+                setattr(self.component, attribute, function)
         self._jobs = Jobs(lambda work, *arguments: wiring.from_thread(self.guarded, "job", work, *arguments), self.component.preload())
         self.component.work = self._jobs.submit
         self.component.log.receivers.append(self._log)
@@ -94,14 +96,38 @@ class ComponentNode(Node):
         self._unwatched.add(subscription)
         return subscription
 
+    def host_time(self) -> int:
+        """Return the time of the node's clock, simulation time if `use_sim_time` is set [ns]."""
+        clock = self.get_clock().handle
+        with clock:
+            return int(clock.get_now().nanoseconds)  # as `Clock.now` has it, without an object of the time: this runs at 500 Hz
+
     def use_local_clock(self) -> None:
         """Receive simulation time as values if its publisher is in this process: messages to every node, 100 times a second,
         would delay steps. Called when all nodes of the process exist."""
         for subscription in tuple(self.subscriptions):
+            if subscription.msg_type is not ClockMessage or subscription.raw:
+                continue
             topic = subscription.topic_name
-            if subscription.msg_type is ClockMessage and not subscription.raw and self.wiring.writer(topic) is not None:
+            if self.wiring.writer(topic) is not None:
                 self.wiring.add_reader(topic, partial(self._pass_time, subscription.callback))
                 self.destroy_subscription(subscription)
+            else:
+                subscription.callback = partial(self._check_time, subscription.callback)
+        clock = self.resolve_topic_name("/clock")
+        if self.wiring.writer(clock) == self.get_fully_qualified_name():
+            self.create_timer(CLOCK_CHECK_PERIOD, partial(self._warn_foreign_clocks, clock), clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _warn_foreign_clocks(self, clock: str) -> None:
+        for publisher in foreign_publishers(self, clock, {self.get_fully_qualified_name()}):
+            self.warn_once(f"{clock}: {publisher} publishes it, too: the clocks of nodes in other processes follow both")
+
+    def _check_time(self, callback: Callable[[ClockMessage], None], message: ClockMessage) -> None:
+        """Refuse a negative time, on which rclpy would raise an exception that ends the process."""
+        if message.clock.sec < 0:
+            self.warn_once("/clock: a negative time is ignored")
+        else:
+            callback(message)
 
     @staticmethod
     def _pass_time(callback: Callable[[ClockMessage], None], stamp: int) -> None:
@@ -261,7 +287,7 @@ class ComponentNode(Node):
     def _publish_heartbeat(self) -> None:
         """Repeat the last diagnostics while the component emits none, so that an idle node differs from one that hangs."""
         if time.monotonic() - self._last_report_time >= HEARTBEAT_PERIOD:
-            self._publish_diagnostics(replace(self._last_report, stamp=self.get_clock().now().nanoseconds))
+            self._publish_diagnostics(replace(self._last_report, stamp=self.host_time()))
 
     def _publish_diagnostics(self, diagnostics: Diagnostics) -> None:
         self._last_report_time, self._last_report = time.monotonic(), diagnostics

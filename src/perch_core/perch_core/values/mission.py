@@ -14,7 +14,7 @@ class PerchGoal:
     """Goal of the action `perch`; fields as in perch_msgs/action/Perch, NaN: the mission's parameters apply.
 
     Attributes:
-        mode: 0 surface, 1 powerline, 2 inspection.
+        mode: mission; 0 surface, 1 powerline, 2 inspection, others as in `perch_control.mission.missions`.
         search_frame: frame of `search_position` [m] and `search_attitude`; empty: above the start.
     """
 

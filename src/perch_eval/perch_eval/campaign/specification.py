@@ -131,13 +131,13 @@ def _check(campaign: Campaign, file: str) -> None:
     Raises:
         ConfigError: a run cannot be flown; the message contains its number and values.
     """
-    vehicles: dict[tuple[str, str], Vehicle] = {}
+    vehicles: dict[tuple[str, ...], Vehicle] = {}
     parameters: dict[str, Any] = {}
     different = {json.dumps(run.values): run for run in reversed(campaign.runs)}
     for run in sorted(different.values(), key=lambda run: run.number):
         source = f"{file}: run {run.number} ({values_text(run.values)})"
         scenario = config.from_mapping(Scenario, campaign.mapping(run), source)
-        names = scenario.vehicle, scenario.target.board
+        names = scenario.vehicle, scenario.target.board, scenario.mission_type
         if names not in vehicles:
             vehicles[names] = check_names(scenario, source)
         if campaign.engine == "stack":

@@ -80,13 +80,22 @@ class Loop:
         self.filters: dict[tuple[str, str], Filter] = {}
         self.trace = FlightTrace()
         server_participants = {name: LocalParticipant(server, name=name) for name, server in servers.items()}
-        send_request = local_servers(server_participants.values())
-        members = {name: _FilteredParticipant(component, self.filters, send_request=send_request, name=name)
-                   for name, component in components.items()}
+        self._send_request = local_servers(server_participants.values())
+        members = {name: self._member(name, component) for name, component in components.items()}
         self._participants = server_participants | members
         self._schedule = Schedule(vehicle, members.values(), tasks)
         for component in (vehicle, *self.components.values()):
             self.trace.tap(component)
+
+    def _member(self, name: str, component: Component[Any]) -> _FilteredParticipant:
+        return _FilteredParticipant(component, self.filters, send_request=self._send_request, name=name)
+
+    def restart(self, name: str, component: Component[Any]) -> None:
+        """Replace a component in flight by a new one, as when its node is killed and started again."""
+        self.components[name].close()
+        self.components[name], self._participants[name] = component, self._member(name, component)
+        self.trace.tap(component)
+        self._schedule.join(self._participants[name])
 
     @property
     def time(self) -> float:

@@ -11,8 +11,11 @@ from perch_core.ros import topics
 from perch_core.values import CameraImage, Serialized
 
 CAMERAS = ("down", "front")
-WITHOUT_STAMP = ("/tf", "/tf_static", "robot_description", "trajectory", "recovery")
-"""Channels whose messages have no header, or a start time in the future as stamp: they get the newest stamp of the others."""
+WITHOUT_STAMP = ("/tf", "/tf_static", "robot_description", "trajectory", "recovery", "/diagnostics")
+"""Channels whose messages have no header, a start time in the future as stamp, or, on `/diagnostics`, stamps of any node's clock:
+they get the newest stamp of the others."""
+STRAY = 2_000_000_000
+"""A stamp that differs from the host's time by more than this is not used as time: the message is late, or of another clock [ns]."""
 
 C = TypeVar("C")
 T = TypeVar("T", bound=type[Component[Any]])
@@ -45,13 +48,15 @@ class Listener(Component[C]):
 
     Attributes:
         resolve: function from a channel to its fully resolved topic; set by a host with a namespace.
-        newest: newest stamp so far [ns].
+        host_time: function that returns the host's time [ns], 0 as long as there is none; set by a host.
+        newest: newest stamp so far that is not stray [ns].
     """
 
     def __init__(self, config: C) -> None:
         super().__init__(config)
         self.resolve: Callable[[str], str] = lambda channel: f"/{channel.lstrip('/')}"
         self.newest = 0
+        self.host_time: Callable[[], int] = lambda: 0
 
     def on_message(self, channel: str, message: Serialized) -> None:
         """Handle a message of a channel."""
@@ -62,14 +67,18 @@ class Listener(Component[C]):
         raise NotImplementedError
 
     def serialized(self, channel: str, message: Any) -> Serialized:
-        """Return a message in serialised form, whichever form the host delivers; for `STAMPLESS`, with the newest stamp."""
+        """Return a message in serialised form, whichever form the host delivers, with the time at which it is shown or recorded:
+        its stamp, for `WITHOUT_STAMP` the newest stamp, or, where that is stray, the host's time."""
         if not isinstance(message, Serialized):
             stamp = getattr(message, "stamp", 0)
             message = Serialized(self.resolve(channel), stamp, topics.encode(channel, message), topics.message_type(channel))
-        if channel in WITHOUT_STAMP:
-            return message._replace(stamp=self.newest)
-        self.newest = max(self.newest, message.stamp)
-        return message
+        time, now = self.newest if channel in WITHOUT_STAMP else message.stamp, self.host_time()
+        if time < 0 or (now and abs(time - now) > STRAY):
+            if channel not in WITHOUT_STAMP and not 0 <= time <= now:  # not just late
+                self.warn(f"{channel}: stamp {1e-9 * time:.3f} s is not of this clock, which shows {1e-9 * now:.3f} s", min_interval=1.0)
+            return message._replace(stamp=now)
+        self.newest = max(self.newest, time)
+        return message._replace(stamp=time)
 
 
 def subscribed_to(channels: Iterable[str]) -> Callable[[T], T]:

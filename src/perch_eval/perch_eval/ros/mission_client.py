@@ -30,6 +30,9 @@ START_TIMEOUT = 300.0   # [s] a node whose sources changed compiles first
 CANCEL_TIMEOUT = 60.0   # simulation time that the mission has to end a cancelled goal: to leave a perch, or to descend [s]
 CHECK_PERIOD = 0.5      # of the check whether the mission that took the goal is still there [s]
 EXPLAIN_AFTER = 5.0     # simulation time that has not advanced for so long is explained [s]
+CLOCK_JUMP_MAX = 10.0   # by which one message of the clock may be ahead [s], plus ...
+CLOCK_RATE_MAX = 50.0   # ... so many times the wall-clock time since the last one; others are not of the simulation
+CLOCK_FIRST_MAX = 1e8   # of the first one [s]: no simulation has run for years, and the wall clock shows more
 SILENCE_TIMEOUT = 3.0   # a node that has sent no diagnostics for so long is reported [s]
 
 
@@ -95,6 +98,7 @@ class MissionClient(GraphNode):
         self._client = ActionClient(self.node, Perch, "perch")
         self._vehicle = self.node.get_namespace().rstrip("/") + "/vehicle"
         self.time, self.waiting_for, self._last_check = 0.0, "", 0.0
+        self._last_clock = time.monotonic()  # when time advanced last [s]
         self._last_message: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
         self.processes: dict[str, str] = {}
         self._silent: set[str] = set()
@@ -248,7 +252,11 @@ class MissionClient(GraphNode):
             raise PerchError(f"{problem} within {timeout:g} s{waiting}")
 
     def _receive_clock(self, msg: Clock) -> None:
-        self.time = max(self.time, msg.clock.sec + 1e-9 * msg.clock.nanosec)
+        """Advance time; rclpy does not tell who has sent a message, so a foreign clock is recognised by its implausible jump."""
+        clock, now = msg.clock.sec + 1e-9 * msg.clock.nanosec, time.monotonic()
+        jump_max = CLOCK_JUMP_MAX + CLOCK_RATE_MAX * (now - self._last_clock) if self.time else CLOCK_FIRST_MAX
+        if 0.0 < clock - self.time <= jump_max:
+            self.time, self._last_clock = clock, now
 
     def _receive_diagnostics(self, msg: DiagnosticArray) -> None:
         for status in msg.status:

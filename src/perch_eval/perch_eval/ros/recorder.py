@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 
 import cv2
@@ -26,7 +27,7 @@ CHANNELS = (
 class RecorderParameters:
     """Parameters of the node `recorder`."""
 
-    file: str = text("flight.mcap", doc="where to write")
+    file: str = text("flight.mcap", doc="where to write; an existing file is kept, and a number put into the name")
     image_rate: float = quantity(6.0, unit="Hz", low=0.0, high=60.0, doc="images kept per second and camera, 0: none")
     image_quality: int = quantity(80, unit="%", low=10, high=100, doc="JPEG quality")
 
@@ -44,17 +45,20 @@ class Recorder(Listener[RecorderParameters]):
 
     def __init__(self, config: RecorderParameters) -> None:
         super().__init__(config)
+        self._file = _unused(Path(config.file))
         self._log: McapLog | None = None
         self._last_image: dict[str, int] = {}
         self._messages, self._last_report = 0, -NANOSECONDS
         self._failure = ""
 
     def warm_up(self) -> None:
-        """Open the file."""
+        """Open the file; where there is one of an earlier recording, a new one beside it, as `flight.1.mcap`."""
         try:
-            self._log = McapLog(Path(self.config.file))
+            self._log = McapLog(self._file)
         except OSError as error:
             self._stop_recording(error)
+        if self._file != Path(self.config.file):
+            self.warn(f"{self.config.file} exists and is kept: recording to {self._file}")
 
     def on_message(self, channel: str, message: Serialized) -> None:
         """Write a message to the file."""
@@ -82,7 +86,7 @@ class Recorder(Listener[RecorderParameters]):
         if now - self._last_report >= NANOSECONDS:
             self._last_report = now
             level, message = (2, self._failure) if self._failure else (0, "ok")
-            self.diagnostics(Diagnostics(self.newest, {"messages": self._messages}, level, message))
+            self.diagnostics(Diagnostics(now, {"messages": self._messages}, level, message))
 
     def close(self) -> None:
         """Finish the file."""
@@ -106,8 +110,14 @@ class Recorder(Listener[RecorderParameters]):
         log, self._log = self._log, None
         if log is not None:
             log.abandon()
-        self._failure = f"recording stopped: {self.config.file}: {error.strerror or error}"
+        self._failure = f"recording stopped: {self._file}: {error.strerror or error}"
         self.log(LogLine("error", f"{self._failure}; the flight goes on, and what is written can be read"))
+
+
+def _unused(file: Path) -> Path:
+    """Return the file, or if it exists the first of `<name>.1.<suffix>`, `<name>.2.<suffix>`, ... that does not."""
+    candidates = (file.with_suffix(f".{k}{file.suffix}") for k in count(1))
+    return next(one for one in chain([file], candidates) if not one.is_file())
 
 
 def jpeg(image: CameraImage, quality: int) -> CompressedPixels | None:

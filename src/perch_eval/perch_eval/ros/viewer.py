@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from perch_core.component import Output
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.values import NANOSECONDS, AtEnd, CameraImage, Marker, Markers, OdometryState, Serialized
+from perch_core.values.limits import problem
 from perch_core.vehicle import load_vehicle
 from perch_eval.extras import require
 from perch_eval.ros.definitions import schema_of
@@ -133,34 +135,46 @@ class Viewer(Listener[ViewerParameters]):
     def _update_scene(self, channel: str, message: Serialized) -> None:
         """Keep the data of the scene; odometry triggers its drawing."""
         if channel == "odometry" and self._scene_pace(message.stamp):
-            self._draw(topics.decode(channel, message.data))
+            self._draw(_decoded(channel, message.data), message.stamp)
         elif channel == "ground_truth/odometry":
             self._truth = message.data
         elif channel == "trajectory":
-            order = topics.decode(channel, message.data)
+            order = _decoded(channel, message.data)
             self._plan = plan_markers(order.trajectory, order.at_end == AtEnd.CONTACT)
         elif channel == "target/pose":
-            pose = topics.decode(channel, message.data)
+            pose = _decoded(channel, message.data)
             self._target = target_markers(pose.p_WS, pose.q_WS)
         elif channel == "powerlines":
-            lines = topics.decode(channel, message.data)
+            lines = _decoded(channel, message.data)
             self._mapped |= {line.id for line in lines.lines}
             self._map = map_markers(lines, self._mapped)
         elif channel == "controller/status":
-            self._status = topics.decode(channel, message.data).message
+            self._status = _decoded(channel, message.data).message
 
-    def _draw(self, state: OdometryState) -> None:
-        """Send the scene with the vehicle at a state."""
+    def _draw(self, state: OdometryState, time: int) -> None:
+        """Send the scene with the vehicle at a state; `time` is that of the scene [ns]."""
         self._flown.add(state.p_WB)
         found = vehicle_markers(self._vehicle, state, self._status)
         if self._truth:
-            truth = topics.decode("ground_truth/odometry", self._truth)
+            truth = _decoded("ground_truth/odometry", self._truth)
             self._true_path.add(truth.p_WB)
             found += truth_markers(self._vehicle, truth)
         if self._scenes % SLOW_SCENE == 0:
             found += self._world + self._plan + self._target + self._map + path_markers(self._flown, self._true_path)
         self._scenes += 1
-        scene = Markers(state.stamp, tuple(found))
+        scene = Markers(time, tuple(found))
         self.markers(scene)
         self._send(self.serialized(MARKERS, scene))
-        self.server.broadcast_time(state.stamp)
+        self.server.broadcast_time(time)
+
+
+def _decoded(channel: str, data: bytes) -> Any:
+    """Return the value of a serialised message.
+
+    Raises:
+        PerchError: it cannot be converted, or is beyond the limits of its type.
+    """
+    value = topics.decode(channel, data)
+    if reason := problem(value):
+        raise PerchError(reason)
+    return value

@@ -132,15 +132,20 @@ def target_markers(p: np.ndarray, q: np.ndarray) -> list[Marker]:
     return [marker(Shape.CUBE, "target", 0, (*FOUND[:3], 0.5), (0.6, 0.6, 0.015), p, q), arrow("target", 1, FOUND, p, p + 0.3 * normal)]
 
 
+def _map_id(line: int) -> int:
+    """Return the marker's id of a mapped cable, in the range of the message; the next one is that of its text."""
+    return 2 * line % 2**31
+
+
 def map_markers(lines: PowerlineMap, before: Collection[int]) -> list[Marker]:
     """Return the cables as mapped, with their ids; ids of `before` that are not in the map are deleted."""
     out = []
     for id in sorted(set(before) - {line.id for line in lines.lines}):
-        out += [removed(Shape.LINE_STRIP, "map", 2 * id), removed(Shape.TEXT, "map", 2 * id + 1)]
+        out += [removed(Shape.LINE_STRIP, "map", _map_id(id)), removed(Shape.TEXT, "map", _map_id(id) + 1)]
     for line in lines.lines:
         start, end = np.array(line.start), np.array(line.end)
-        out += [polyline("map", 2 * line.id, FOUND, 2 * max(line.radius, 0.01), (start, end)),
-                label("map", 2 * line.id + 1, FOUND, 0.12, (start + end) / 2 + (0.0, 0.0, 0.12), f"{line.id}")]
+        out += [polyline("map", _map_id(line.id), FOUND, 2 * max(line.radius, 0.01), (start, end)),
+                label("map", _map_id(line.id) + 1, FOUND, 0.12, (start + end) / 2 + (0.0, 0.0, 0.12), f"{line.id}")]
     return out
 
 

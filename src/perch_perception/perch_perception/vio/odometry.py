@@ -13,8 +13,9 @@ import numpy as np
 from perch_core import so3
 from perch_core.camera import Camera
 from perch_core.camera_mount import CameraMount
-from perch_core.values import ImuSample
+from perch_core.values import ImuSample, OdometryState
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
+from perch_perception.ukf.odometry import pose_of
 from perch_perception.ukf.stillness import energy, is_at_rest, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
@@ -37,6 +38,7 @@ _MAX_BLIND_TAKE_OFF = 1.0  # the same at a take-off, from rest on [s]
 _MAX_TAKE_OFF_SIGMA = 0.05  # largest 1 sigma of the velocity in a blind take-off [m/s]
 _DIVERGENCE_FRAMES = 15  # frames over which observations that are refused and used are counted
 _MAX_STAMP_LEAD = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
+_KEPT_ODOMETRY = 200  # values: 0.4 s at 500 Hz, longer than an image takes
 _INERTIAL = np.r_[at.POSITION, at.VELOCITY, at.THETA, at.GYRO_BIAS, at.ACCEL_BIAS]  # the order of an estimate's covariance
 
 
@@ -65,7 +67,8 @@ class VisualInertialOdometry:
         self._views: deque[tuple[int, Features]] = deque()  # (exposure, features) at rest, not passed by the filter
         self._recent_views = RecentViews()
         self._biases: tuple[np.ndarray, np.ndarray] | None = None  # of gyro and accelerometer (6,) and their variances, of the last filter
-        self._lost_at: tuple[int, float] | None = None  # when the last filter ended, and how fast it was [ns, m/s]
+        self._known_at: tuple[int, float] | None = None  # stamp of the known pose in motion, and the speed then [ns, m/s]
+        self._odometry: deque[OdometryState] | None = deque(maxlen=_KEPT_ODOMETRY)  # of the estimator; None from the first start on
         self._at_rest = False
         self._at_configured_start = True  # the vehicle has not left the configured start
         self._last_visual_update: int | None = None  # when vision last changed the state; None: not since the last rest
@@ -127,6 +130,11 @@ class VisualInertialOdometry:
         """Store a sample; bad ones are bridged or refused, see `ImuOutcome`."""
         return self._imu.add(sample)
 
+    def add_odometry(self, odometry: OdometryState) -> None:
+        """Store odometry of the estimator, which a first start in flight continues; later odometry derives from this one."""
+        if self._odometry is not None:
+            self._odometry.append(odometry)
+
     def add_image(self, stamp: int, image: np.ndarray) -> VioResult:
         """Process a frame.
 
@@ -167,7 +175,7 @@ class VisualInertialOdometry:
 
         A vehicle at rest is assumed to rest there still. One in motion may have turned by any angle.
         """
-        moved = self._lost_at is not None or (self.filter is not None and not self._at_rest)
+        moved = self._known_at is not None or (self.filter is not None and not self._at_rest)
         if self.filter is not None:
             self._drop_filter()
         if moved:
@@ -198,10 +206,13 @@ class VisualInertialOdometry:
     # -- before the start --------------------------------------------------------------------------------------------
 
     def _try_start(self, exposure: int, features: Features) -> VioResult:
-        """Start at rest or, when the vehicle moves, from the frames of the last half second or more."""
+        """Start at rest or, when the vehicle moves, from the frames of the last half second or more.
+
+        The pose is that of the estimator's odometry, where there is any: then the vehicle may be in flight.
+        """
+        self._take_odometry(exposure)
         steps = window(self._imu, exposure)
-        biases, variance = self._biases or (None, None)
-        if self._recent_views.is_static() is not False and is_at_rest(steps, biases, variance, bool(self._recent_views.is_static(STATIC_DURATION))):
+        if self._may_start_at_rest(steps):
             self._begin(start.at_rest(self.config, self.mount, exposure, steps,
                                       self._known_pose_with_bias(steps[:, GYRO].mean(axis=0))))
             return self._hold(exposure, features)
@@ -214,22 +225,47 @@ class VisualInertialOdometry:
         outcome = FrameOutcome.LOST if self.restarts else FrameOutcome.INITIALISING
         return VioResult(outcome, None, len(features.ids), restarts=self.restarts, message=outcome.value)
 
+    def _may_start_at_rest(self, steps: np.ndarray) -> bool:
+        """Whether the last IMU steps (m, 9) and images are those of a vehicle at rest.
+
+        With odometry it may hover, where for moments either looks like rest: the IMU must be quiet and the image static for long.
+        """
+        biases, variance = self._biases or (None, None)
+        for_long = self._recent_views.is_static(STATIC_DURATION)
+        if self._odometry:
+            return for_long is not False and is_at_rest(steps, biases, variance)
+        return self._recent_views.is_static() is not False and is_at_rest(steps, biases, variance, bool(for_long))
+
+    def _take_odometry(self, exposure: int) -> None:
+        """Make the newest odometry before an exposure the known pose."""
+        odometry = next((o for o in reversed(self._odometry or ()) if self._imu.oldest <= o.stamp < exposure), None)
+        if odometry is None:
+            return
+        pose = pose_of(odometry)
+        if pose.problem() is None:
+            self._known_pose = start.odometry_pose(pose)
+            self._known_at = pose.stamp, float(np.linalg.norm(odometry.v_B))
+            self._rotation_bias, self._at_configured_start = self._motion_start.gyro_bias, False
+            part = preintegrate(self._imu.run(pose.stamp, exposure), self._rotation_bias, np.zeros(3))
+            self._rotation = part.dR, part.J[:3, :3]
+
     def _known_pose_with_bias(self, gyro_bias: np.ndarray) -> KnownPose:
         """Return the known present pose, with the heading propagated by the gyro less this bias."""
         dR, J = self._rotation
         return replace(self._known_pose, R_WB=self._known_pose.R_WB @ dR @ so3.exp(J @ (gyro_bias - self._rotation_bias)))
 
     def _begin(self, state: at.State) -> None:
-        if self._lost_at is not None:
-            since, speed = self._lost_at
+        if self._known_at is not None:
+            since, speed = self._known_at
             if since >= self._imu.oldest:
                 start.propagate_position(state, preintegrate(self._imu.run(since, state.stamp), state.gyro_bias, state.accel_bias))
             else:  # its motion since then is unknown
                 reach = 1e-9 * (state.stamp - since) * max(speed, float(np.linalg.norm(state.v_WB)))
                 state.P[at.POSITION, at.POSITION] += reach**2 * np.eye(3)
-            self._lost_at = None
+            self._known_at = None
         self.filter = Msckf(self.config, state, self.mount.camera.fx)
         self._last_update = state.stamp
+        self._odometry = None
         self._observation_counts.clear()
 
     # -- afterwards --------------------------------------------------------------------------------------------------
@@ -324,7 +360,7 @@ class VisualInertialOdometry:
         self._store_pose()
         s = self._running.state
         speed = float(np.linalg.norm(s.v_WB))
-        self._lost_at = s.stamp, speed if speed < SPEED_MAX else SPEED_MAX
+        self._known_at = s.stamp, speed if speed < SPEED_MAX else SPEED_MAX
         self._begin_motion_start()
         self.filter, self._at_rest, self._at_configured_start, self.restarts = None, False, False, self.restarts + 1
 
@@ -332,8 +368,7 @@ class VisualInertialOdometry:
         """Store the pose and biases for a new start, unless they are not finite."""
         s = self._running.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
-            rows = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])
-            self._known_pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), _estimate(s).pose_covariance[rows])
+            self._known_pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), _estimate(s).pose_covariance[start.POSE_ROWS])
             self._biases = _biases(s)
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport, now: at.State | None = None) -> VioResult:

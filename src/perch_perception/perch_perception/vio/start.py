@@ -9,6 +9,7 @@ from perch_core import so3
 from perch_core.camera_mount import CameraMount
 from perch_core.vehicle import GRAVITY
 
+from perch_perception.ukf.measurement import VioPose
 from perch_perception.ukf.stillness import REST_VELOCITY, energy
 from perch_perception.ukf.unscented import ACCEL, DT, GYRO
 from perch_perception.vio import ekf
@@ -20,6 +21,7 @@ from perch_perception.vio.state import State
 
 # 1 sigma of (p, heading) as given: they define W, so hardly any; not none, which would make the covariance singular [m, rad]
 CONFIGURED_POSE_SIGMA = (0.001, 0.001, 0.001, 0.001)
+POSE_ROWS = np.ix_([0, 1, 2, 5], [0, 1, 2, 5])  # position and heading in the covariance of a pose
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,11 @@ class KnownPose:
 def configured_pose(p_WB: np.ndarray, yaw: float) -> KnownPose:
     """Return the pose at the start from a configured position [m], shape (3,), and yaw [rad]."""
     return KnownPose(np.array(p_WB, float), so3.exp(np.array([0.0, 0.0, yaw])), np.diag(np.square(CONFIGURED_POSE_SIGMA)))
+
+
+def odometry_pose(pose: VioPose) -> KnownPose:
+    """Return the pose in the odometry of a running estimator; its covariance is made regular."""
+    return KnownPose(pose.p_WB, so3.quat_to_matrix(pose.q_WB), pose.covariance[POSE_ROWS] + np.diag(np.square(CONFIGURED_POSE_SIGMA)))
 
 
 def levelled(R_WB: np.ndarray, up_B: np.ndarray) -> np.ndarray:

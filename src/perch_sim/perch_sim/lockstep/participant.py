@@ -129,6 +129,9 @@ class LocalParticipant(Participant):
 
     The batch is finished at once, unless a due answer to one of the component's own requests is missing, or the first batch waits
     for a goal.
+
+    Attributes:
+        now: stamp of the newest batch [ns]; 0 before the first.
     """
 
     def __init__(self, component: Component[Any], codec: Codec | None = None, send_request: SendRequest | None = None,
@@ -153,7 +156,7 @@ class LocalParticipant(Participant):
         self._timers: list[list[Any]] = [[0, round(port.period * NANOSECONDS), port.handler(component)] for port in ports(kind, Timer)]
         self._external_calls: deque[Callable[[], None]] = deque()  # requests and goals, in front of the next batch
         self._awaited: list[_Awaited] = []
-        self._now, self._begun = 0, False
+        self.now, self._begun = 0, False
         self._batch: Iterator[Packet] | None = None  # what is left of it
         self._await_goal = await_goal
         if await_goal and await_goal not in (port.name for port in ports(kind, Action)):
@@ -168,7 +171,7 @@ class LocalParticipant(Participant):
         """Process a batch, or wait for the goal or the answers that it needs."""
         if now > START_DEADLINE:
             self._await_goal = ""
-        self._now, self._batch, self._begun = now, iter(batch), True
+        self.now, self._batch, self._begun = now, iter(batch), True
         self._continue_batch()
 
     def results(self) -> list[Packet] | None:
@@ -185,10 +188,10 @@ class LocalParticipant(Participant):
 
     def _continue_batch(self) -> None:
         if self._external_calls or self._awaited or self._await_goal:
-            if self._await_goal or not all(awaited.answer.done() for awaited in self._awaited if awaited.due <= self._now):
+            if self._await_goal or not all(awaited.answer.done() for awaited in self._awaited if awaited.due <= self.now):
                 return
             self._deliver_pending()
-        now, handle = self._now, self._handlers
+        now, handle = self.now, self._handlers
         for packet in self._batch or ():  # if the component fails on one, the next call continues behind it
             handle[packet.channel](packet.value)
         for timer in self._timers:
@@ -200,7 +203,7 @@ class LocalParticipant(Participant):
     def _deliver_pending(self) -> None:
         while self._external_calls:
             self._external_calls.popleft()()
-        for awaited in [awaited for awaited in self._awaited if awaited.due <= self._now]:
+        for awaited in [awaited for awaited in self._awaited if awaited.due <= self.now]:
             self._awaited.remove(awaited)  # one by one: if the component fails on one, the others remain
             try:
                 answer = awaited.answer.result()

@@ -84,6 +84,10 @@ class ParticipantNode(ComponentNode):
         self.create_timer(CONNECT_PERIOD, self._try_connect, clock=self._steady)
         self._try_connect()
 
+    def host_time(self) -> int:
+        """Return the stamp of the newest batch, 0 before the first; a foreign clock has no effect [ns]."""
+        return self.participant.now
+
     # -- batches from another process --------------------------------------------------------------------------------
 
     def _try_connect(self) -> None:
