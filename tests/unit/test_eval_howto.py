@@ -3,9 +3,12 @@
 import re
 import shlex
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import start_stack
+from perch_control.laws import LAWS
+from perch_control.mission.missions import MISSIONS
 from perch_core.tag_board import load_board
 from perch_eval import comparison, demo, soak
 from perch_eval.campaign import command as campaign
@@ -15,6 +18,7 @@ from perch_eval.graph_faults import campaign as faults
 from perch_eval.recordings import command as perceive
 from perch_eval.recordings import sensors_command
 from perch_eval.replay import command as replay
+from perch_perception.estimators import ESTIMATORS
 from perch_sim.scenario import load_scenario
 
 GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*.md"))
@@ -60,7 +64,8 @@ def test_python_runs(text, tmp_path, monkeypatch, capsys):
         (tmp_path / re.match(r"# (\S+)", module).group(1)).write_text(module)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    exec(compile(text, guide.name, "exec"), {})
+    with patch.dict(LAWS), patch.dict(ESTIMATORS), patch.dict(MISSIONS):  # guides add to them
+        exec(compile(text, guide.name, "exec"), {})
     assert capsys.readouterr().out.split()[0] in ("perched", "missed")
 
 
