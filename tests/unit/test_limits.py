@@ -1,4 +1,4 @@
-"""What may enter: each kind of limit, the door before every component, and the page that says so."""
+"""Limits of inputs: each kind of limit, the door before every component, and the page that says so."""
 
 from __future__ import annotations
 

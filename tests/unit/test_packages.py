@@ -13,12 +13,13 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = sorted(folder.parent.name for folder in (ROOT / "src").glob("*/setup.py"))
-KEYS = {"PIL": "python3-pil", "cv2": "python3-opencv", "filterpy": "python3-filterpy-pip", "matplotlib": "python3-matplotlib",
-        "nlopt": "python3-nlopt", "numba": "python3-numba", "numpy": "python3-numpy", "psutil": "python3-psutil",
-        "pymavlink": "python3-pymavlink-pip", "rosbags": "python3-rosbags-pip", "scipy": "python3-scipy", "yaml": "python3-yaml"}
+KEYS = {"PIL": "python3-pil", "casadi": "casadi-pip", "cv2": "python3-opencv", "filterpy": "python3-filterpy-pip",
+        "matplotlib": "python3-matplotlib", "nlopt": "python3-nlopt", "numba": "python3-numba", "numpy": "python3-numpy",
+        "psutil": "python3-psutil", "pymavlink": "python3-pymavlink-pip", "rosbags": "python3-rosbags-pip",
+        "scipy": "python3-scipy", "yaml": "python3-yaml"}
 """Module -> key of rosdep (ros/rosdistro, rosdep/python.yaml)."""
-WITHOUT_KEY = {"casadi": "casadi", "daqp": "daqp", "distributed": "distributed", "evo": "evo", "foxglove": "foxglove-sdk", "mcap": "mcap",
-               "osqp": "osqp", "zstandard": "zstandard"}
+WITHOUT_KEY = {"daqp": "daqp", "distributed": "distributed", "evo": "evo", "foxglove": "foxglove-sdk", "mcap": "mcap", "osqp": "osqp",
+               "zstandard": "zstandard"}
 """Module -> package on PyPI that rosdep does not know."""
 
 

@@ -51,7 +51,7 @@ def machine() -> str:
 
 def _page(sections: Sequence[Section], duration: float) -> list[str]:
     found = counts(sections)
-    lines = ["# Results", "", f"It took {duration / 60:.0f} min, without flights of the same code that were there already.", "",
+    lines = ["# Results", "", f"It took {duration / 60:.0f} min, excluding flights reused from an earlier run.", "",
              f"{found[HOLDS]} claims hold, {found[FAILS]} fail, {found[VACUOUS]} are vacuous (nothing occurred that they are "
              f"about); {found[BETTER]} further values are better than the paper's, {found[WORSE]} worse; "
              f"{found[MISSING]} rows are not available.", "",

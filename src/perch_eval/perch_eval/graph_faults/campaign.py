@@ -146,9 +146,9 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             + f" on {machine()}.", "",
             f"* **{len(safe)} of {len(struck)} end safely**: hovering, landed, perched, or with the motors off on the ground.",
             f"* **{len(reported)} of {len(struck) - len(unaffected)} are named within {REPORT_LIMIT:g} s** of the wall clock: a node, or the sender of the",
-            "  goal, names the missing node or messages. The node that was struck does not count as a source, nor does what starts the",
-            f"  processes. Not counted: {len(unaffected)} flights whose messages were disturbed and that perched as if they had not been.",
-            f"* **{len(clean)} of {len(rows)} leave nothing**: no process, no socket of the lockstep, no shared memory in the end.",
+            "  goal, names the missing node or messages. Reports by the faulted node or by the launcher are not counted.",
+            f"  Not counted: {len(unaffected)} flights whose messages were disturbed and that perched as if they had not been.",
+            f"* **{len(clean)} of {len(rows)} leave no residue**: no process, no socket of the lockstep, no shared memory in the end.",
             f"* {hard_impacts.total()} of those that end safely hit the floor with more than {FALL_SPEED:g} m/s"
             + (f"; struck were: {', '.join(f'{node} ({n})' for node, n in hard_impacts.items())}." if hard_impacts else "."),
             f"* In {sum(bool(row['ended']) for row in rows)} flights a node that was not struck ended.",
@@ -172,7 +172,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         text += [f"Named after: median {times[len(times) // 2]:.1f} s, worst {times[-1]:.1f} s.", ""]
     bad = [f"* **{row['fault']} {row['node']}, {row['phase']}, {row['mode']}** (seed {row['seed']}): {'; '.join(problems(row))}. "
            f"Goal: {row['goal']}" for row in rows if problems(row)]
-    text += ["## Flights that are not good", "", *(bad or ["None."])]
+    text += ["## Failed flights", "", *(bad or ["None."])]
     return "\n".join(text) + "\n"
 
 

@@ -259,4 +259,4 @@ def check_takeover(turned: bool, armed: bool | None) -> Check:
                      "no source reports that the motors turn (rotor_state, or `armed` in /diagnostics)",
                      "with the props off: --takeover, and flip the pilot's switch when asked")
     return make_check(title, armed is True, "the motors stopped while commands went on" if armed else "the motors went on turning",
-                      "with his own arming switch off, the pilot's switch must stop them: check its channel and range (MSP OVERRIDE)")
+                      "with the pilot's arming switch off, the takeover switch must stop them: check its channel and range (MSP OVERRIDE)")

@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--shake", choices=("down", "front"),
                      help="camera whose rotation to the IMU is checked; shake the vehicle for 10 s when asked")
     out.add_argument("--props-off", action="store_true", help="no propellers are mounted: the motors may be started")
-    out.add_argument("--takeover", action="store_true", help="with --props-off: the pilot will take over, with his own arming switch off")
+    out.add_argument("--takeover", action="store_true", help="with --props-off: the pilot will take over, with the pilot's arming switch off")
     out.add_argument("--watchdog", action="store_true", help="with --props-off: the controller will be stopped by hand")
     return out
 
