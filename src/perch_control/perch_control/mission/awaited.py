@@ -54,11 +54,11 @@ def overdue(now: int, since: int, newest: Mapping[str, int | None]) -> str:
 
 
 def overdue_at_start(waited: int, ticked: int, newest: Mapping[str, int | None]) -> str:
-    """Return the same before the first odometry, when there is no stamp to compare with.
+    """Return what is overdue before the first odometry, when there is no stamp to compare with.
 
     Args:
         waited: time of the wait [ns].
-        ticked: the same as counted in ticks; where it is far longer, simulated time stands still [ns].
+        ticked: time of the wait as counted in ticks; where it is far longer, simulated time stands still [ns].
         newest: as in `overdue`.
     """
     clock = ["/clock"] if ticked - waited > OVERDUE else []
