@@ -156,8 +156,8 @@ class Search:
     def run(self) -> tuple[np.ndarray, Outcome]:
         """Search from each of the first durations in `STARTS` until every limit is proved; return the durations and the outcome.
 
-        Longer durations only are reached from each, and the shortest that admit a plan may be missed: which plans violate limits
-        depends on the ratio of the segments, too.
+        From each, only longer durations are reached, in which the segments grow differently: where one start misses the durations
+        that admit a plan, another may find them.
         """
         found = []
         for factor, programs in STARTS:
