@@ -21,7 +21,7 @@ EXAMPLES = """examples:
   python3 scripts/start_stack.py                                       scenario surface_90
   python3 scripts/start_stack.py --scenario my.yaml --seed 3 --composed
   python3 scripts/start_stack.py --composed vehicle estimator controller mission
-  python3 scripts/start_stack.py --without mission                     start it yourself (run_node.py)
+  python3 scripts/start_stack.py --realtime --without mission          start it yourself (run_node.py)
   python3 scripts/start_stack.py --only vehicle --realtime
   python3 scripts/start_stack.py --composed --view                     watch it in Foxglove, ws://localhost:8765
   python3 scripts/start_stack.py -p vehicle.cameras:=none -p estimator.coasting_after:=0.3

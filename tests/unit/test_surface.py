@@ -1,4 +1,4 @@
-"""The perching surface's frame, against the definitions in docs/architecture.md."""
+"""The perching surface's frame, against the definitions in docs/interface.md."""
 
 from __future__ import annotations
 
