@@ -11,6 +11,7 @@ Takes about 0.1 s per problem; it can be stopped at any time (Ctrl-C, kill) and 
 from __future__ import annotations
 
 import argparse
+import shlex
 import signal
 import sys
 import time
@@ -24,6 +25,7 @@ from random_perches import random_problem, shipped_settings
 from perch_core import config
 from perch_core.json_values import to_text, write_json
 from perch_core.vehicle import load_vehicle
+from perch_eval.evaluation.document import machine
 from perch_eval.revision import code_version
 from perch_planner.planner import plan
 from perch_planner.problem import PerchSettings
@@ -81,7 +83,8 @@ def main() -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
     ms = 1e3 * np.array(times or [np.nan])
-    result = {**code_version(), "problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
+    result = {**code_version(), "machine": machine(), "command": shlex.join(["python3", *sys.argv]),
+              "problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
               "findings_of_the_verifier": broken, "unconfirmed_refusals": unconfirmed, "exceptions": exceptions,
               "plan_ms": {"median": float(np.median(ms)), "p90": float(np.percentile(ms, 90)), "max": float(ms.max())},
               "duration_s_median": float(np.median(durations or [np.nan])), "wall_clock_s": round(time.time() - begin, 1)}
