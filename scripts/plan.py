@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -113,13 +114,18 @@ def main() -> int:
         if arguments.animation and mapping["kind"] != "powerline":
             raise ConfigError("--animation", mapping["kind"], "only for powerline")
         source = " ".join([str(path), *(f"--set {change}" for change in arguments.set)])
-        return KINDS[mapping["kind"]](mapping, source, arguments.out, arguments.animation)
+        code = KINDS[mapping["kind"]](mapping, source, arguments.out, arguments.animation)
+        sys.stdout.flush()
+        return code
     except PlanningRefusal as refusal:
         print(f"refused ({refusal.code}): {refusal}", file=sys.stderr)
         return 2 if refusal.code == "bad_input" else 1
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # `plan.py ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # no second error at exit
+        return 1
     except OSError as error:
         print(f"error: --out: {arguments.out}: cannot be written: {error.strerror}", file=sys.stderr)
         return 2

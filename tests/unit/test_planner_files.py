@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from perch_core import config
 from perch_core.errors import ConfigError
 from perch_planner.planner import plan
 from perch_planner.problem_file import read_problem
-from system.scripts import call_script
+from system.scripts import ROOT, call_script
 
 NAMES = ("surface_90", "surface_60_waypoints", "ceiling", "moving_pad")
 
@@ -60,3 +63,13 @@ def test_the_script_says_what_is_wrong_by_word_and_exit_code(arguments, code, wo
     done = call_script("plan.py", *arguments, "--out", str(tmp_path / "never"))
     assert done.returncode == code and words in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "never").exists()
+
+
+def test_the_script_ends_quietly_where_its_output_is_closed():
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run([sys.executable, ROOT / "scripts" / "plan.py", "surface_90"], stdout=writing, stderr=subprocess.PIPE, text=True)
+    finally:
+        os.close(writing)
+    assert done.returncode == 1 and done.stderr == ""

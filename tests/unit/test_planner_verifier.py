@@ -51,6 +51,7 @@ def test_the_untouched_plan_is_accepted():
     ({"rotors": dataclasses.replace(NEED.rotors, thrust=(0.4, 1.1))}, "rotor thrust, least"),
     ({"rotors": dataclasses.replace(NEED.rotors, thrust=(0.1, 0.7))}, "rotor thrust, greatest")])
 def test_a_broken_requirement_is_found(changes, words):
+    """[M:eq15]"""
     assert words in findings(**changes)
 
 
