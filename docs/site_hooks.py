@@ -1,6 +1,7 @@
 """Hooks of mkdocs: pages from the top of the repository, and links to files that are no pages.
 
-README.md becomes the first page. A link to a source file becomes its text: the site has pages only.
+README.md becomes the first page. A link to a source file becomes its text and path: the site has pages only. A link whose
+text is a path gets the title of its page.
 """
 
 from __future__ import annotations
@@ -38,12 +39,21 @@ def _linked(link: re.Match[str], here: str, source: str) -> str:
     path = normpath(f"{Path(source).parent.as_posix()}/{target}")
     if (ROOT / path).is_dir() and (ROOT / path / "README.md").exists():
         path = f"{path}/README.md"
+    name = text.strip("`").lstrip("./")
+    if name.endswith(".md") or "/" in name and path.removesuffix("/README.md").endswith(name):
+        text = _title(path) or text
     if path in PAGES:
         there = PAGES[path]
     elif path.startswith("docs/") and (ROOT / path).is_file():
         there = path.removeprefix("docs/")
     elif (ROOT / path).exists():
-        return text
+        return text if path.endswith(name) else f"{text} (`{re.sub('^src/[^/]+/', '', path)}`)"
     else:
         return link[0]  # mkdocs says that it is broken
     return f"{image}[{text}]({relpath(there, Path(here).parent.as_posix())}{anchor})"
+
+
+def _title(path: str) -> str:
+    """First heading of a page; empty if the file is none."""
+    found = re.search(r"^# (.+)$", (ROOT / path).read_text(), re.M) if path.endswith(".md") and (ROOT / path).is_file() else None
+    return found[1] if found else ""
