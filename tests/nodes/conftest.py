@@ -13,7 +13,7 @@ def free(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Running
     """All of `FREE`; the mapper, which looks through another vehicle's camera, is in `/lines`. In the end they stop cleanly on SIGTERM."""
     with reserved_domain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
-        with nodes(FREE, tmp_path_factory.mktemp("free"), {"powerline_mapper": "/lines"}, {"perching_planner": {"time_limit": 60.0}}) as running:
+        with nodes(FREE, tmp_path_factory.mktemp("free"), {"powerline_mapper": "/lines"}, {"perching_planner": {"time_limit": 45.0}}) as running:
             yield running
 
 

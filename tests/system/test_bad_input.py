@@ -190,7 +190,7 @@ def spoil(message, path: str, value: float) -> None:
     setattr(message, leaf, value)
 
 
-@pytest.mark.parametrize("asker", [("perch_planner.perching_planner_node", "-p", "time_limit:=60.0")], indirect=True)
+@pytest.mark.parametrize("asker", [("perch_planner.perching_planner_node", "-p", "time_limit:=45.0")], indirect=True)
 def test_the_planner_refuses_numbers_that_are_none_and_goes_on_working(asker):
     client = asker.caller.create_client(PlanPerch, "plan_perch")
     asker.wait(client.service_is_ready)

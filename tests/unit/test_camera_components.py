@@ -201,14 +201,14 @@ def test_an_image_of_another_kind_is_told(changes):
     assert bench.out["sighting"][-1].message == "blind"
 
 
-@pytest.mark.parametrize("encoding", ["mono8", "8UC1", "rgb8", "bgr8", "8UC3"])
+@pytest.mark.parametrize("encoding", ["mono8", "rgb8", "bgr8"])
 def test_every_encoding_is_looked_at_in_grey(encoding):
     bench = Bench()
     bench.odometry(0, 200)
     pixels = np.zeros((480, 640, 3), np.uint8)
     pixels[..., 0 if encoding == "rgb8" else 2] = 200  # red
     grey = np.full((480, 640), 60, np.uint8)
-    bench.component.on_image(picture(100 * MS, encoding=encoding, pixels=grey if encoding in ("mono8", "8UC1") else pixels))
+    bench.component.on_image(picture(100 * MS, encoding=encoding, pixels=grey if encoding == "mono8" else pixels))
     assert bench.eye.asked[0][0].shape == (480, 640)
     assert abs(int(bench.eye.asked[0][0][0, 0]) - 60) <= 1
 

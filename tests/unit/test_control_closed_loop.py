@@ -50,7 +50,7 @@ def test_a_plan_is_flown_as_it_is_to_its_contact(name):
 
 
 def test_an_overhang_that_the_rotors_lag_spoils_is_refused_by_the_geometric_law_and_flown_by_the_nmpc():
-    plan = perch("surface_120_2m")
+    plan = perch("surface_125_2m")
     loop = make_loop()
     loop.begin_in_hover()
     with pytest.raises(TrajectoryRefused, match="misses the contact by .* the NMPC"):

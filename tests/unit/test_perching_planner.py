@@ -48,7 +48,7 @@ def ask() -> Asked:
 
 @pytest.fixture(scope="module")
 def isolated() -> Iterator[Asked]:
-    parameters = PerchingPlannerParameters(time_limit=60.0)  # a busy machine is no fault of the planner
+    parameters = PerchingPlannerParameters(time_limit=45.0)  # a busy machine is no fault of the planner
     runner = IsolatedRunner(PerchingPlanner(parameters).preload())
     assert runner.wait_ready()
     yield planner(parameters, runner)

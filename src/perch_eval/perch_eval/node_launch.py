@@ -23,7 +23,7 @@ PARTICIPANTS = frozenset(flight_tasks(Latency()))
 """Nodes that take part in the simulator's lockstep."""
 ALWAYS = ("description",)
 """Nodes that are started with every scenario."""
-LOCKSTEP_PLAN_TIMEOUT = 60.0  # wall-clock limit of a plan for which simulation time waits [s]
+LOCKSTEP_PLAN_TIMEOUT = 45.0  # wall-clock limit of a plan for which simulation time waits [s]
 HOST_PARAMETERS = ("lockstep", "lockstep_hold", "use_sim_time")
 """Parameters of a node's host; they are not passed to its component."""
 

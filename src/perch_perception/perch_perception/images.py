@@ -9,9 +9,6 @@ from perch_core.camera import Camera, Region
 from perch_core.errors import PerchError
 from perch_core.values import CameraImage
 
-CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3}
-_BLUE_FIRST = ("bgr8", "8UC3")
-
 
 class ImageError(PerchError):
     """Raised when an image cannot be used because of its encoding, size or data."""
@@ -23,8 +20,8 @@ def check_image(image: CameraImage, camera: Camera) -> None:
     Raises:
         ImageError: an encoding that is not 8 bits per channel, or a size other than the camera's.
     """
-    if image.encoding not in CHANNELS:
-        raise ImageError(f"image: encoding {image.encoding!r} is not one of {', '.join(CHANNELS)}")
+    if image.encoding not in CameraImage.CHANNELS:
+        raise ImageError(f"image: encoding {image.encoding!r} is not one of {', '.join(CameraImage.CHANNELS)}")
     if (image.width, image.height) != (camera.width, camera.height):
         raise ImageError(f"image: {image.width} x {image.height} px is not the camera's {camera.width} x {camera.height}")
 
@@ -44,7 +41,7 @@ def image_array(image: CameraImage, camera: Camera, region: Region | None = None
     pixels = image.pixels(region)
     if pixels is None:
         raise ImageError("image: there are no pixels")
-    shape = (image.height, image.width) if CHANNELS[image.encoding] == 1 else (image.height, image.width, 3)
+    shape = (image.height, image.width) if CameraImage.CHANNELS[image.encoding] == 1 else (image.height, image.width, 3)
     if pixels.dtype != np.uint8 or pixels.shape != shape:
         raise ImageError(f"image: pixels {pixels.dtype} {pixels.shape} are not {image.encoding} of {image.width} x {image.height} px")
     return pixels
@@ -55,7 +52,7 @@ def mono_image(image: CameraImage, camera: Camera, region: Region | None = None)
     pixels = image_array(image, camera, region)
     if pixels.ndim == 2:
         return pixels
-    return cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY if image.encoding in _BLUE_FIRST else cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY if image.encoding == "bgr8" else cv2.COLOR_RGB2GRAY)
 
 
 def rgb_image(image: CameraImage, camera: Camera) -> np.ndarray:
@@ -67,4 +64,4 @@ def rgb_image(image: CameraImage, camera: Camera) -> np.ndarray:
     pixels = image_array(image, camera)
     if pixels.ndim == 2:
         raise ImageError(f"image: encoding {image.encoding!r} has no colour")
-    return np.ascontiguousarray(pixels[..., ::-1]) if image.encoding in _BLUE_FIRST else pixels
+    return np.ascontiguousarray(pixels[..., ::-1]) if image.encoding == "bgr8" else pixels

@@ -49,7 +49,7 @@ class PerchingPlannerParameters(PerchParameters):
     """Parameters of the component: those of the planner, and the vehicle it plans for."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
-    time_limit: float = quantity(2.0, unit="s", above=0.0, high=60.0, doc="wall-clock limit of a plan, from the request on")
+    time_limit: float = quantity(2.0, unit="s", above=0.0, high=45.0, doc="wall-clock limit of a plan, from the request on")
 
     @property
     def settings(self) -> PerchSettings:

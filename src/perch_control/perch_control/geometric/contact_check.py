@@ -16,6 +16,7 @@ from perch_core.flatness import commanded_frame
 from perch_core.jit import compiled
 from perch_core.vector3 import quaternion_of
 from perch_core.vehicle import GRAVITY, Vehicle
+from perch_control.geometric.law import cone_before_contact
 from perch_control.geometric.step import control_step, drag_compensation, predicted
 from perch_control.reference import Setpoint, Source, packed_many
 from perch_control.rotor_lag import RotorEstimate, approached, thrusts
@@ -27,7 +28,7 @@ SPAN = 1.5  # the last part of the trajectory is flown [s]
 
 
 @compiled
-def simulate(start, speed, table, gains, limits, narrow, window, lead, lag, period, vehicle):
+def simulate(start, speed, table, gains, limits, settling, lead, lag, period, vehicle):
     """State at the end of a simulated flight of the geometric controller; see `GeometricController.end_on_model`."""
     state, command = start, speed
     duration, mass, J = len(table) * period, vehicle[0][0], vehicle[0][1:4]
@@ -40,8 +41,7 @@ def simulate(start, speed, table, gains, limits, narrow, window, lead, lag, peri
         reference = (r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11], r[12], r[13], r[14], r[15],
                      r[16], r[17], r[18], r[19], r[20], r[21], r[22], r[23],
                      r[24], r[25], r[26], r[27], r[28], r[29], r[30], r[31], r[32])
-        part = min(max((duration - k * period) / window, 0.0), 1.0)
-        cone = narrow + part * (limits[1] - narrow)
+        cone = cone_before_contact(duration - k * period, limits[1], settling)
         command = control_step(state, reference, speed, command, none, gains,
                                (limits[0], cone, limits[2], limits[3], limits[4]), lead, lag, vehicle)[0]
         f = thrusts(approached(speed, command, middle), coefficient)

@@ -10,6 +10,7 @@ import numpy as np
 from perch_control.admission import TrajectoryRefused
 from perch_control.allocation import mixing_columns
 from perch_control.geometric.contact_check import contact_error, simulate
+from perch_control.geometric.law import cone_before_contact
 from perch_control.geometric.step import control_step
 from perch_control.law import NO_COMPENSATION, ControlOutput, Law
 from perch_control.reference import Following, Source
@@ -22,8 +23,7 @@ if TYPE_CHECKING:
 RATE_RESERVE = 1.3        # commanded rates may exceed what a plan may ask for by this factor, so that feedback has room
 FEEDBACK_MAX = 8.0        # bound of the position feedback: what the weakest vehicle here has beside its weight [m/s^2]
 CONE_DEG = 40.0           # the feedback turns the thrust no further from the reference's: it cannot turn the vehicle over [deg]
-CONE_CONTACT_DEG = 5.0    # the same at a contact: at its thrust 10 cm of error would tilt the vehicle by 12 deg [deg]
-CONTACT_WINDOW = 0.3      # before the contact, over which the cone narrows to that: the thrust is low by then [s]
+SETTLING = 2.0            # time constants of the tilt before a contact in which the feedback no longer turns the thrust
 CONTACT_MISS = 0.02       # a contact trajectory is refused where the law misses its end by more on the model [m]
 CONTACT_SPEED_MISS = 0.05  # the same for the velocity [m/s]
 THRUST_FLOOR = 0.8        # specific thrust below which a direction is noise [m/s^2]
@@ -53,7 +53,8 @@ class GeometricController(Law):
         self.gains = gains
         self._vehicle = packed_vehicle(vehicle)
         self._gains = (*gains.position, *gains.velocity, *gains.attitude, *gains.rate)
-        self._wide, self._narrow = tan(radians(CONE_DEG)), tan(radians(CONE_CONTACT_DEG))
+        self._cone = tan(radians(CONE_DEG))
+        self._settling = SETTLING * 2.0 / min(gains.rate[:2])  # an error of the tilt decays as exp(-rate t / 2)
         self._rate_max = RATE_RESERVE * vehicle.body_rate_max
         self.step((0.0,) * 9 + (1.0, 0.0, 0.0, 0.0), (0.0,) * 16 + (1.0,) + (0.0,) * 16, RotorEstimate.at_idle(vehicle))
 
@@ -81,10 +82,9 @@ class GeometricController(Law):
             reference: setpoint `lag` seconds from now, 33 floats (see `Setpoint.packed`).
             rotors: rotor speeds and their commands.
             compensation: acceleration in W and angular acceleration in B that compensate for disturbances, 6 floats.
-            time_to_contact: [s]; near zero, position feedback is reduced in favour of the attitude.
+            time_to_contact: [s]; in the last moments the feedback does not turn the thrust.
         """
-        share = min(max(time_to_contact / CONTACT_WINDOW, 0.0), 1.0)
-        cone = self._narrow + share * (self._wide - self._narrow)
+        cone = cone_before_contact(time_to_contact, self._cone, self._settling)
         out = control_step(state, reference, rotors.speed, rotors.command, compensation, self._gains, self._limits(cone),
                            self.gains.lead, self.lag, self._vehicle)
         return ControlOutput(*out)
@@ -114,5 +114,5 @@ class GeometricController(Law):
         Returns:
             State at the contact, shape (13,).
         """
-        return simulate(tuple(start.tolist()), rotors.speed, table, self._gains, self._limits(self._wide), self._narrow,
-                     CONTACT_WINDOW, self.gains.lead, self.lag, self.period, self._vehicle)
+        return simulate(tuple(start.tolist()), rotors.speed, table, self._gains, self._limits(self._cone), self._settling,
+                        self.gains.lead, self.lag, self.period, self._vehicle)

@@ -15,6 +15,22 @@ from perch_core.jit import compiled
 from perch_core.vector3 import axes_of, axpy, cross, dot, limited, norm, quaternion_of, quaternion_product, scale, times
 from perch_core.vehicle import GRAVITY
 
+CONE_CLOSING = 0.3  # time over which the cone closes before a contact: the thrust is low by then [s]
+
+
+@compiled
+def cone_before_contact(time_to_contact, widest, settling):
+    """Tangent of the cone's half angle: `widest`, closed linearly, and zero from `settling` before the contact on.
+
+    Feedback that turned the thrust in the last moments would tilt the vehicle at the contact, and hardly move it until then.
+
+    Args:
+        time_to_contact: [s].
+        widest: tangent far from a contact.
+        settling: time in which an error of the tilt settles [s].
+    """
+    return widest * min(max((time_to_contact - settling) / CONE_CLOSING, 0.0), 1.0)
+
 
 @compiled
 def position_feedback(e_p, e_v, k_p, k_v, bound):

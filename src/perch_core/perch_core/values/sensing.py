@@ -30,13 +30,15 @@ class CameraImage:
     """One image; it may be rendered only when its pixels are read.
 
     Attributes:
+        CHANNELS: encoding -> number of channels of 8 bits.
         stamp: stamp of the camera board: middle of the exposure plus the camera's stamp offset [ns].
         frame: optical frame.
         width, height: [px].
-        encoding: mono8, rgb8 or bgr8.
+        encoding: one of `CHANNELS`.
         ready: reports whether `pixels` returns at once; None: always. The scheduler waits until an image is rendered.
     """
 
+    CHANNELS = {"mono8": 1, "rgb8": 3, "bgr8": 3}
     __slots__ = ("stamp", "frame", "width", "height", "encoding", "_pixels", "ready")
 
     def __init__(self, stamp: int, frame: str, width: int, height: int, encoding: str, pixels: np.ndarray | Callable[..., np.ndarray | None],

@@ -30,7 +30,7 @@ from rclpy.clock import Clock, ClockType
 CONNECT_PERIOD = 0.1   # between attempts to connect to the vehicle [s]
 CHECK_PERIOD = 0.005   # between checks whether an unfinished batch can continue [s]
 POLL_TIMEOUT = 0.01    # wait for a batch before other events are processed [s]
-ANSWER_TIMEOUT = 65.0  # an answer this late was lost with its server: no planner is given more than 60 s [s]
+ANSWER_TIMEOUT = 50.0  # an answer this late was lost with its server: more than a plan may take, less than `lockstep_timeout` [s]
 BURST = 40             # batches between which other events are processed
 OBSERVED = ("/diagnostics", "/tf", "/tf_static", "robot_description")  # taken on arrival by components that only store messages
 

@@ -13,8 +13,7 @@ from perch_core.ros.messages.basic import flat, floats, header, quaternion_float
 from perch_core.values import CameraImage, CameraModel, CompressedPixels, ImuSample, StampedTransform, Transform
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
-CHANNELS = {"mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3}
-_ENCODINGS = {"8UC1": "mono8", "8UC3": "bgr8"}  # what the bytes mean in ROS' generic encodings
+_GENERIC = {"8UC1": "mono8", "8UC3": "bgr8"}  # what the bytes mean in ROS' generic encodings
 
 
 def imu_value(msg: Imu) -> ImuSample:
@@ -36,15 +35,15 @@ def image_value(msg: Image) -> CameraImage:
     Raises:
         PerchError: an encoding other than mono8, 8UC1, rgb8, bgr8, 8UC3, or truncated data.
     """
-    if msg.encoding not in CHANNELS:
-        raise PerchError(f"image: encoding {msg.encoding!r} is not one of {', '.join(CHANNELS)}")
-    channels, data = CHANNELS[msg.encoding], np.frombuffer(msg.data, np.uint8)
+    encoding = _GENERIC.get(msg.encoding, msg.encoding)
+    if encoding not in CameraImage.CHANNELS:
+        raise PerchError(f"image: encoding {msg.encoding!r} is not one of {', '.join((*CameraImage.CHANNELS, *_GENERIC))}")
+    channels, data = CameraImage.CHANNELS[encoding], np.frombuffer(msg.data, np.uint8)
     if not msg.height or not msg.width or msg.step < msg.width * channels or data.size < msg.step * msg.height:
         raise PerchError(f"image: {data.size} bytes in rows of {msg.step} do not fit {msg.width} x {msg.height} px of {msg.encoding}")
     rows = data[: msg.step * msg.height].reshape(msg.height, msg.step)[:, : msg.width * channels]
     pixels = rows if channels == 1 else rows.reshape(msg.height, msg.width, channels)
-    return CameraImage(stamp_value(msg.header.stamp), msg.header.frame_id, msg.width, msg.height,
-                       _ENCODINGS.get(msg.encoding, msg.encoding), pixels)
+    return CameraImage(stamp_value(msg.header.stamp), msg.header.frame_id, msg.width, msg.height, encoding, pixels)
 
 
 def compressed_value(msg: CompressedImage) -> CameraImage:
@@ -72,7 +71,7 @@ def compressed_message(image: CompressedPixels) -> CompressedImage:
 
 def image_message(image: CameraImage) -> Image:
     """Convert an image to `sensor_msgs/Image`."""
-    channels = CHANNELS[image.encoding]
+    channels = CameraImage.CHANNELS[image.encoding]
     msg = Image(header=header(image.stamp, image.frame), height=image.height, width=image.width, encoding=image.encoding,
                 step=image.width * channels)
     msg.data = array.array("B", np.ascontiguousarray(image.pixels()).tobytes())  # any other sequence takes 18 ms
