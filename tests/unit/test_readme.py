@@ -8,6 +8,7 @@ import re
 import shlex
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -169,16 +170,14 @@ def class_name(msg_type: type) -> str:
 def test_topics_have_publishers_types_and_durability_as_named(row, nodes):
     topics, profiles = code(row[0]), row[2].split(",")
     types = full_types(row[1], "msg")
-    named = [name for name in nodes if name in row[5].split(", ") or row[5] == "all"]
-    assert named, f"no node is called {row[5]}"
-    publishers = [p for name in named for p in nodes[name].publishers]
+    named = list(nodes) if row[5] == "all" else row[5].split(", ")
     for k, topic in enumerate(topics):
         wanted = types[k if len(types) > 1 else 0]
-        found = [p for p in publishers if p.topic_name == f"/{topic.lstrip('/')}"]
-        assert len(found) >= len(row[5].split(", ")), f"{row[5]}: not each publishes {topic}: {sorted(p.topic_name for p in publishers)}"
+        of_node = {name: [p for p in nodes[name].publishers if p.topic_name == f"/{topic.lstrip('/')}"] for name in named}
+        assert all(of_node.values()), f"{topic} is not published by {', '.join(name for name in named if not of_node[name])}"
         profile = profiles[k if len(profiles) > 1 else 0]
         latched = DurabilityPolicy.TRANSIENT_LOCAL if "TL" in profile else DurabilityPolicy.VOLATILE
-        for publisher in found:
+        for publisher in chain.from_iterable(of_node.values()):
             assert class_name(publisher.msg_type) == wanted
             assert publisher.qos_profile.durability == latched, topic
             if re.search(r"\d", profile):
