@@ -92,13 +92,17 @@ drone stands still, where the truth jitters by millimetres; the floor is 1 m bel
 TAGS = """
 OpenVINS and VINS-Mono report some centimetres of ATE on the whole of V1_01 (58 m), which is not among these recordings.
 
-![The path over the photographed floor](floor_path.png)
+![Path over the photographed floor](floor_path.png)
 
-![Its error within three sigma](floor_error.png)
+*Path over the photographed floor: truth and VIO, from above and from the side*
+
+![Error over the photographed floor](floor_error.png)
+
+*Error over the photographed floor: position with 3 sigma of VIO, and attitude*
 
 ## Tags
 
-pupil-apriltags (`pip install pupil-apriltags`) with `quad_decimate` 1 on the same images, beside:
+Beside pupil-apriltags (`pip install pupil-apriltags`) with `quad_decimate` 1 on the same images:
 """
 WIRES = """
 NASA's reference lacks tags: a detection beyond it is false unless it is on a tag of number 0 that was seen by eye (their places are
@@ -107,7 +111,7 @@ distances between its rows and columns: the paper is not flat. The rotation seri
 
 ## Wires
 
-By length, within 8 px of what is traced (which are a wire's edges). PLDU and PLDM: all photographs of the published test sets, every
+By length, within 8 px of the traced edges of a wire. PLDU and PLDM: all photographs of the published test sets, every
 sixth of which was used to choose thresholds. The street's wires are not traced: the arcs in these pictures were judged by eye, and a point
 was marked on each that is on a wire (`WIRES_SEEN`). The others follow window frames, joints in a wall, edges of roofs
 and walls, and poles.
@@ -128,7 +132,7 @@ def motion(f: Figures) -> list[str]:
         "" if vio["ate_rmse_deg"] is None else f", {vio['ate_rmse_deg']:.2f} deg")
     drift = "" if vio["drift_percent"] is None else f", {vio['drift_percent']:.2f} %"
     return [f"{vio['compared_s']:.1f} s, {vio['path_m']:.1f} m", ate, f"{100 * vio['final_error_m']:.1f} cm{drift}",
-            f"{vio['attitude_rms_deg']:.2f} deg", f"{vio['nees_position_mean']:.1f}", str(f["restarts"])]
+            f"{vio['attitude_rms_deg']:.2f} deg", f"{vio['nees_position_mean'] / 3:.1f}", str(f["restarts"])]
 
 
 def race(f: Figures) -> list[str]:
@@ -198,7 +202,7 @@ def page(results: Mapping[str, Figures], command: str) -> list[str]:
     lines = ["# Perception on recordings", "", banner([commit()], [digest()]), "", f"Made by `{command}` on {machine()}. This page is generated.",
              INTRODUCTION, *table("recording | what it is | source | licence", (
                  (r.title, r.about, ", ".join(f"`{p}`" for p in r.paths) or "this repository", r.licence) for r in RECORDINGS.values())),
-             ODOMETRY, *table("recording | compared | ATE | at the end | attitude | NEES (3) | restarts", (
+             ODOMETRY, *table("recording | compared | ATE | at the end | attitude | NEES per dimension | restarts", (
                  [RECORDINGS[key].title, *(motion(results[key]) if key in results else [MISSING])] for key in ("v101", "floor")))]
     if "v101" in results:
         f = results["v101"]
@@ -206,7 +210,7 @@ def page(results: Mapping[str, Figures], command: str) -> list[str]:
                   f"{f['frames']['RESTING']} of {f['images']['cam0']} frames. The estimator's attitude is wrong by "
                   f"{f['estimator']['attitude_rms_deg']:.2f} deg from the start on.", V101]
     if "racing" in results:
-        lines += [RACING, *table(f"flight | path | final error of each seed | required: at most {RACING_ERROR_MAX} % | NEES over 3 | frames lost",
+        lines += [RACING, *table(f"flight | path | final error of each seed | required: at most {RACING_ERROR_MAX} % | NEES per dimension | frames lost",
                                  map(race, results["racing"]["flights"]))]
     return [*lines, TAGS, *table("recording | ours | pupil-apriltags", (
         pair("nasa", corners), pair("rotation", turns),

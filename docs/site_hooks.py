@@ -47,7 +47,7 @@ def _linked(link: re.Match[str], here: str, source: str) -> str:
     elif path.startswith("docs/") and (ROOT / path).is_file():
         there = path.removeprefix("docs/")
     elif (ROOT / path).exists():
-        return text if path.endswith(name) else f"{text} (`{re.sub('^src/[^/]+/', '', path)}`)"
+        return text if path.endswith(name.partition(": ")[0]) else f"{text} (`{re.sub('^src/[^/]+/', '', path)}`)"
     else:
         return link[0]  # mkdocs says that it is broken
     return f"{image}[{text}]({relpath(there, Path(here).parent.as_posix())}{anchor})"

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
@@ -100,6 +99,7 @@ def main() -> int:
     leave_quietly_on_interrupt()
     from perch_core import config
     from perch_core.errors import ConfigError, PerchError, PlanningRefusal
+    from perch_core.processes import discard_closed_output
 
     try:
         if arguments.list:
@@ -124,7 +124,7 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:  # `plan.py ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # no second error at exit
+        discard_closed_output()
         return 1
     except OSError as error:
         print(f"error: --out: {arguments.out}: cannot be written: {error.strerror}", file=sys.stderr)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 import sys
 
 from perch_setup import command_parser, enter
@@ -74,6 +73,7 @@ def carry_out(command_line: argparse.ArgumentParser) -> int:
     arguments = command_line.parse_args()
     enter()
     from perch_core.errors import PerchError  # as rclpy, inside the environment only
+    from perch_core.processes import discard_closed_output
 
     module, function = arguments.handler.split(":")
     try:
@@ -89,5 +89,5 @@ def carry_out(command_line: argparse.ArgumentParser) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:  # `topic.py echo ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_closed_output()
         return 0

@@ -52,7 +52,7 @@ def test_a_definition_is_found_through_what_calls_it(tmp_path):
     root = tree(tmp_path, LAW)
     assert wrong(root) == [] and "none" in wrong(root, 3)[0]
     place, = definitions(root)["M", "eq2"]
-    assert (place.file, place.name) == ("src/perch_a/perch_a/law.py", "gain") and f"[`gain`](../{place.file})" in page(root)
+    assert (place.file, place.name) == ("src/perch_a/perch_a/law.py", "gain") and f"[`perch_a/law.py: gain`](../{place.file})" in page(root)
 
 
 @pytest.mark.parametrize("flown", ["from perch_a import law\nNODE = law.law()\n", "import perch_a.law as l\nNODE = l.law\n",

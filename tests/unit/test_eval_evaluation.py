@@ -46,7 +46,8 @@ def test_the_exit_code_tells_failed_claims_and_missing_rows(tmp_path, monkeypatc
     assert command.main(["--out", "results"]) == code
     page = (tmp_path / "results" / "README.md").read_text()
     content = json.loads((tmp_path / "results" / "results.json").read_text())
-    assert ("**FAILS**" in page) == (code == 1)
+    assert ("**FAILS**" in page) == ("| part | row | value | claim |" in page) == (code == 1)
+    assert page.index("claims hold") < page.index("*holds*: ") < page.index("Made by ") < page.index("\n## ")
     assert "| 0 of 0 |  | *vacuous* |" in page or parts == {"a": broken}
     assert "`python3 scripts/evaluate.py --seeds 5 --line-seeds 1 --layouts 3 --out results` on " in page
     assert content["command"].endswith("--out results") and len(content["digest"]) == 12 and content["commit"] and content["machine"]

@@ -151,6 +151,15 @@ def test_a_stroboscopic_picture_shows_each_instant_of_the_perch(recorded, tmp_pa
         assert image.size == (1100, 616)
 
 
+def test_labels_of_a_stroboscopic_picture_cover_no_other_body(recorded):
+    view = FlightView.from_flight(RecordedFlight(recorded[0]), load_vehicle("snapdragon"))
+    descent = view.truth.p[:, :1] * [0.1, 0.0, -0.8] + [0.0, 0.0, 3.0]
+    figure = stroboscope(replace(view, truth=replace(view.truth, p=descent)), 1.5, 3.4, 9)
+    axes, labels = figure.axes[0], [text for text in figure.axes[0].texts if "°" in text.get_text()]
+    discs = [disc.get_datalim(axes.transData).transformed(axes.transData) for disc in axes.collections if disc.get_zorder() > 3.0]
+    assert len(labels) > 3 and all(sum(label.get_window_extent().overlaps(disc) for disc in discs) == 0 for label in labels)
+
+
 def test_mp4_needs_no_other_program(recorded, tmp_path, monkeypatch):
     path, _ = recorded
     monkeypatch.setenv("PATH", "")

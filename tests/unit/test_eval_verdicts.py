@@ -43,6 +43,18 @@ def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch)
     assert set(verdicts(ways_out.sections(effort)[0]).values()) == {"fails"}
 
 
+def test_refusals_that_differ_in_the_interval_found_are_one_line(effort, monkeypatch):
+    refusals = [f"clearance in [{low}, inf] m, required [0, inf]" for low in ("-0.2", "-inf", "-0.01")] + ["no stop"]
+
+    def rows(effort, name, jobs, work, good):
+        return [] if name == "aborted" else [{"name": "60", "seed": 1, "refused": "", "instants": [(0.5, one) for one in refusals]}]
+
+    monkeypatch.setattr(ways_out, "cached_figures", rows)
+    ways_out.sections(effort)
+    page = (effort.out / "way_out.md").read_text()
+    assert "* 3x 60 deg: clearance in [-inf to -0.01, inf] m, required [0, inf]\n* 1x 60 deg: no stop\n" in page
+
+
 @pytest.mark.slow
 def test_an_inspection_that_is_given_up_has_not_avoided_the_lines(effort, monkeypatch):
     scenario = load_scenario("inspection")

@@ -16,7 +16,7 @@ from perch_planner.planner import plan
 from perch_planner.problem_file import read_problem
 from system.scripts import ROOT, call_script
 
-NAMES = ("surface_90", "surface_60_waypoints", "ceiling", "moving_pad")
+NAMES = ("surface_90", "surface_60", "surface_60_waypoints", "ceiling", "moving_pad")
 
 
 def mapping(name: str = "surface_90") -> dict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -91,6 +92,23 @@ def test_every_node_can_be_started_without_the_ros2_command(node, package, monke
         script.main()
     path, words = started.value.args
     assert Path(path).name == node and Path(path).parent.name == package and words[-1] == "link:=/dev/ttyACM0"
+
+
+@pytest.mark.parametrize("closed, work, code, words", [
+    (True, "print('x' * 10**6)", 1, ""), (True, "print('x')", 1, ""), (False, "os.write(broken, b'x')", 2, "error: [Errno 32] Broken pipe\n")])
+def test_a_command_whose_output_is_closed_ends_quietly_and_another_broken_pipe_is_an_error(closed, work, code, words):
+    program = f"""
+import argparse, os, sys
+from perch_eval.arguments import command
+reading, broken = os.pipe()
+os.close(reading)
+sys.exit(command(argparse.ArgumentParser, lambda _: {work} or 0)([]))"""
+    reading, writing = os.pipe()
+    if closed:
+        os.close(reading)
+    done = subprocess.run([sys.executable, "-c", program], stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (code, words)
 
 
 def test_a_folder_of_results_belongs_to_one_process_at_a_time(tmp_path):

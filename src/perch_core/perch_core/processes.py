@@ -1,11 +1,13 @@
-"""Settings of processes and threads: signals, priorities, BLAS threads and garbage collection."""
+"""Settings of processes and threads: signals, output, priorities, BLAS threads and garbage collection."""
 
 from __future__ import annotations
 
 import ctypes
 import gc
 import os
+import select
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
@@ -36,6 +38,16 @@ def without_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def discard_closed_output() -> bool:
+    """Return whether the reader of standard output has ended (`... | head`); if so, discard what is left to print, for a quiet end."""
+    closed = select.poll()
+    closed.register(sys.stdout.fileno(), 0)
+    if not closed.poll(0):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return True
 
 
 def lower_priority(task: int, nice: int) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from perch_core.errors import ConfigError, PerchError
+from perch_core.processes import discard_closed_output
 
 _locked: dict[Path, int] = {}  # folder of results -> its open file, whose lock ends with this process
 
@@ -31,7 +32,8 @@ def command_parser(name: str, description: str | None, examples: str) -> argpars
 
 def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argparse.Namespace], int], *refusals: type[Exception],
             interrupted: str = "interrupted") -> Callable[..., int]:
-    """Return a program's `main`. Exit code: that of `work`; 2, with a one-line error, for invalid input; 130 after Ctrl-C.
+    """Return a program's `main`. Exit code: that of `work`; 1 if the reader of its output has ended (`... | head`); 2, with a
+    one-line error, for invalid input; 130 after Ctrl-C.
 
     Args:
         parser: returns the command-line parser.
@@ -44,8 +46,12 @@ def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argpa
     def main(arguments: list[str] | None = None) -> int:
         args = parser().parse_args(arguments)
         try:
-            return work(args)
+            code = work(args)
+            sys.stdout.flush()
+            return code
         except errors as error:
+            if isinstance(error, BrokenPipeError) and discard_closed_output():
+                return 1
             text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
             print(f"error: {text}", file=sys.stderr)
             return 2

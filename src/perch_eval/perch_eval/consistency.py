@@ -85,7 +85,7 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int) -> 
 
 
 def plot(results: list[Consistency], path: Path, marks: dict[str, float]) -> None:
-    """Plot each result into an image file, one panel each: average over the runs, expectation and bounds.
+    """Plot each result into an image file, one panel each in two columns: average over the runs, expectation and bounds.
 
     Args:
         results: what `judge` returned.
@@ -94,16 +94,21 @@ def plot(results: list[Consistency], path: Path, marks: dict[str, float]) -> Non
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 2.3 * len(results) + 0.5), layout="constrained")
-    for axes, result in zip(np.atleast_1d(figure.subplots(len(results), 1, sharex=True)), results):
-        axes.axhspan(*result.bounds, color="0.88", label="95 % bounds")
+    rows = -(-len(results) // 2)
+    figure = Figure(figsize=(11.0, 2.3 * rows + 0.5), layout="constrained")
+    panels = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    for axes in panels.flat[len(results):]:
+        axes.axis("off")
+    for axes, result in zip(panels.flat, results):
+        axes.axhspan(*result.bounds, color="0.88")
         axes.axhline(result.dimension, color="0.5", lw=0.8)
         axes.plot(result.times, result.mean, lw=1.0)
         for name, time in marks.items():
             axes.axvline(time, color="C3", lw=0.8, ls=":")
             axes.annotate(name, (time, 0.98), xycoords=("data", "axes fraction"), va="top", fontsize=7, color="C3")
         axes.set_title(f"{result.name}: {100 * result.inside:.0f} % of the time inside, {result.runs} runs", fontsize=9)
-        axes.set_ylabel("mean, should be " + str(result.dimension), fontsize=8)
+        axes.set_ylabel("NEES, mean", fontsize=8)
         axes.set_ylim(0, max(2.5 * result.dimension, 1.1 * float(np.nanpercentile(result.mean, 98))))
-    axes.set_xlabel("time [s]")
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]")
     figure.savefig(path, dpi=130)

@@ -40,6 +40,7 @@ MAX_GROWTH = 1.0              # of a process per 100 flights [MB]
 READY_TIMEOUT = 180.0         # [s]
 MAX_CONSECUTIVE_FAILURES = 5  # after which it ends
 SAVE_EVERY = 20               # flights after which what has been measured is written
+CAPTION = "Memory, descriptors and threads of each process, and size of /dev/shm, over the number of the flight"
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ def plot(flights: Sequence[Flight], file: Path) -> None:
     """Memory, descriptors and threads of each process, and shared memory, by flight."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 8.0), layout="tight")
+    figure = Figure(figsize=(7.0, 8.0), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     x = np.arange(1, len(flights) + 1)
     for name in flights[0].processes:
@@ -189,7 +190,7 @@ def plot(flights: Sequence[Flight], file: Path) -> None:
     for ax, label in zip(axes, ("memory since the\nfirst flight [MB]", "descriptors", "threads", "/dev/shm [MB]")):
         ax.set_ylabel(label)
     axes[3].set_xlabel("flight")
-    axes[0].legend(fontsize=7, ncol=2)
+    figure.legend(loc="outside upper center", fontsize=7, ncols=4)
     figure.savefig(file, dpi=110)
 
 
@@ -197,9 +198,9 @@ def page(folder: Path) -> str:
     """Return the page of all soak runs whose results are in a folder."""
     runs = {file: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
     text = ["# Soak", "", banner([run["commit"] for run in runs.values()], [run.get("digest", "") for run in runs.values()]), "",
-            "Made by `python3 scripts/soak.py`; edit nothing here. One run of the stack over ROS in lockstep: perch, depart,",
+            "Made by `python3 scripts/soak.py`. This page is generated. One run of the stack over ROS in lockstep: perch, depart,",
             f"perch again. Growth of memory by least squares over the flights after the first {WARM_UP_FLIGHTS}; "
-            f"bar: {MAX_GROWTH:g} MB per 100 flights,",
+            f"required: at most {MAX_GROWTH:g} MB per 100 flights,",
             "descriptors and threads constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
     for file, run in runs.items():
         good = sum(flight["departed"] and flight["outcome"] == "perched" for flight in run["flights"])
@@ -216,7 +217,7 @@ def page(folder: Path) -> str:
         shared = [flight["shared"] for flight in run["flights"]]
         bad = _grouped(run["problems"])
         verdict = ["Problems:", "", *(f"* {problem}" for problem in bad)] if bad else ["No problems."]
-        text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB.", *verdict, "", f"![{file.stem}]({file.stem}.png)"]
+        text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB.", *verdict, "", f"![{file.stem}]({file.stem}.png)", "", f"*{CAPTION}*"]
     return "\n".join(text) + "\n"
 
 

@@ -69,7 +69,8 @@ class Limit:
         return f"{shown:g} is outside {self}" if isfinite(shown) or self.optional else f"{shown:g} is not finite"
 
     def __str__(self) -> str:
-        return f"[{self.low:g}, {self.high:g}] {self.unit}".rstrip()
+        low, high = (f"{end:.0f}" if float(end).is_integer() else f"{end:g}" for end in (self.low, self.high))
+        return f"[{low}, {high}] {self.unit}".rstrip()
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,9 @@ from perch_eval.statistics import Rate, Spread
 
 CAMPAIGNS = ("aggressive", "overhang")
 """Names in config/campaigns."""
+VARIED = {"parameters.perching_planner.impact_acceleration": "impact acceleration {:g} m/s^2", "target.inclination_deg": "{:g} deg",
+          "target.height": "height {:g} m"}
+"""Quantity that these campaigns vary -> text of its value."""
 COLUMNS = {"max_body_rate_deg_s": 0, "contact_normal_speed_m_s": 2, "contact_tangential_speed_m_s": 2, "contact_tilt_error_deg": 1}
 """Metric of a flight -> number of decimals."""
 
@@ -26,7 +29,7 @@ COLUMNS = {"max_body_rate_deg_s": 0, "contact_normal_speed_m_s": 2, "contact_tan
 def contact_sections(effort: Effort) -> list[Section]:
     """Return the success rate under each condition; write `contact.md` and `contact.json`."""
     out = Section("c_contact", "Contacts", "Body rate against success at a wall, and surfaces that hang over: the campaigns of that name in "
-                  "config/campaigns, cameras by their error models. Speeds and tilt at each contact: contact.md.")
+                  "config/campaigns, cameras by their error models. Speeds and tilt at each contact: [contact.md](contact.md).")
     groups = {f"`{name}`, cameras rendered": flights for name, flights in perches(effort).items()}
     text = ["# Contacts", "", "Median [range] over the flights that perched. The velcro holds from 0.2 to 1.0 m/s into the surface, up to 0.6 m/s "
             "along it and 15 deg of tilt error. A campaign is flown again by `python3 scripts/campaign.py NAME`.",
@@ -37,7 +40,7 @@ def contact_sections(effort: Effort) -> list[Section]:
         found = cached_runs(effort, name, [Task.from_campaign(campaign, run) for run in campaign.runs])
         data[name], groups = [asdict(r) for r in found], {}
         for r in found:
-            groups.setdefault(", ".join(f"{key.rpartition('.')[2]} {value:g}" for key, value in r.values.items()), []).append(r)
+            groups.setdefault(", ".join(VARIED[key].format(value) for key, value in r.values.items()), []).append(r)
         text += ["", f"## Campaign `{name}`", "", f"{campaign.description[0].upper()}{campaign.description[1:]}.", "", *_table(groups)]
         for condition, flights in groups.items():
             out.show(f"{name}: {condition}", str(_rate(flights)), note=_others(flights))

@@ -33,7 +33,7 @@ def fault_sections(effort: Effort) -> list[Section]:
     flown = cached_figures(effort, "faults", jobs, _fly_with_fault, lambda r: r["end"] in END_STATES)
     about = (f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
              "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth.")
-    out = Section("c_faults", "Faults in flight", f"{about} Flights without a good end: faults_in_flight.md.")
+    out = Section("c_faults", "Faults in flight", f"{about} Flights without a good end: [faults_in_flight.md](faults_in_flight.md).")
     rows = []
     for fault in FAULTS:
         own = [r for r in flown if r["fault"] == fault.name]
@@ -43,7 +43,7 @@ def fault_sections(effort: Effort) -> list[Section]:
         rows.append((f"{fault.name}: {fault.description}", *(ends[e] for e in ENDINGS), without, touched))
         found = f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]) + f"; {without} {NO_WAY_OUT}" * bool(without)
         out.claim(fault.name, found, "", safe + without == len(own) if own else None, "every flight ends hovering, landed or perched, or had no way out")
-    text = ["# Faults in flight", "", f"{about} Every flight: faults_in_flight.json.", "",
+    text = ["# Faults in flight", "", f"{about} Every flight: [faults_in_flight.json](faults_in_flight.json).", "",
             "*crashed*: broken by an impact, or a rotor touched the floor; *lost*: none of the others after 25 s; *touched the wall*: rotors touched "
             f"it on the way, and nothing broke; *{NO_WAY_OUT}*: from the true state in which the fault left the vehicle, without any delay, rotors at "
             "their limits in any combination, changed to any other once, were tried on the plant, and all of them broke it.", "",
@@ -65,8 +65,8 @@ def comparison_sections(effort: Effort) -> list[Section]:
              "(line: as commanded; perch: the plan), RMS per axis x, y, z; "
              f"the state is estimated (VIO model, UKF). Line: ({offset}) m in {LINE_TIME:g} s and 0.5 s of hover. Perch: 90 deg, 1.7 m, to the contact. "
              "Wind 5 m/s blows at 45 deg to the wall. With L1 the controller measures thrust / mass in hover and flies the perch with it.")
-    out = Section("c_comparison", "Controllers compared on the same flights", f"{about} All conditions: comparison.md.")
-    text = ["# Controllers compared", "", f"{about} Every flight: comparison.json."]
+    out = Section("c_comparison", "Controllers compared on the same flights", f"{about} All conditions: [comparison.md](comparison.md).")
+    text = ["# Controllers compared", "", f"{about} Every flight: [comparison.json](comparison.json)."]
     for maneuver in MANEUVERS:
         text += ["", f"## {maneuver.capitalize()}", "", "RMSE x, y, z [cm]; outcomes.", "",
                  *table("| " + " | ".join(CONTROLLERS), ((k, *(_cell(runs[c, k, maneuver]) for c in CONTROLLERS)) for k in CONDITIONS))]
@@ -100,7 +100,7 @@ def _description(r: dict[str, Any]) -> str:
     height, gap, speed, tilt = r["before"]
     return (f"* **{r['fault']}**, seed {r['seed']}, {r['time']:.2f} s after the order to take off ({r['phase'].lower()}): {r['done']}. Then "
             f"{height:.2f} m high, {gap:.2f} m from the wall, {speed:.1f} m/s, tilt {tilt:.0f} deg. "
-            f"End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. {_search_text(r)}{' / '.join(r['events'])}")
+            f"End: {r['end']}; touched {', '.join(r['touched']) or 'nothing'}. {_search_text(r)}Log: {' / '.join(r['events']) or 'empty'}.")
 
 
 def _search_text(r: dict[str, Any]) -> str:
@@ -108,8 +108,8 @@ def _search_text(r: dict[str, Any]) -> str:
     if x is None:
         return ""
     if x["survived"]:
-        return f" A way out is not excluded: of the first {x['tried']} sequences of rotor commands that were tried one broke nothing at first. "
-    return (f" No way out: all {x['tried']} sequences of rotor commands that were tried broke it, the last {1000 * x['latest']:.0f} ms after the "
+        return f"A way out is not excluded: of the first {x['tried']} sequences of rotor commands that were tried one broke nothing at first. "
+    return (f"No way out: all {x['tried']} sequences of rotor commands that were tried broke it, the last {1000 * x['latest']:.0f} ms after the "
             f"fault; within that time rotors of this lag turn the vehicle by no more than {x['turn_deg']:.0f} deg. ")
 
 

@@ -16,18 +16,26 @@ _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: 
 
 
 def write(sections: Sequence[Section], effort: Effort, duration: float) -> None:
-    """Write `README.md` and `results.json` into the folder of the results."""
-    content = {**code_version(), "command": effort.command, "duration_s": duration, "machine": machine(), "sections": [
+    """Write `README.md` and `results.json` into the folder of the results; `duration`: of the evaluation [s]."""
+    content = {"duration_s": duration, "sections": [
         {"key": s.key, "title": s.title, "about": s.about, "rows": [row.__dict__ for row in s.rows],
          "figures": [name for name, _ in s.figures], "data": s.data} for s in sections]}
-    write_page(effort, "README", _page(sections, duration), content, "results")
+    made_by = f"{_made_by(effort)} It took {duration / 60:.0f} min, excluding flights reused from an earlier run."
+    _write(effort, "README", _page(sections, made_by), "results", content)
 
 
-def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, Any], data: str = "") -> None:
-    """Write a page and its data as JSON, both with commit, command and machine; `data`: name of the JSON file, if not `name`."""
-    made_by = [banner([commit()], [digest()]), "", f"Made by `{effort.command}` on {machine()}. This page is generated."]
-    (effort.out / f"{name}.md").write_text("\n".join([lines[0], "", *made_by, *lines[1:]]) + "\n")
-    write_json(effort.out / f"{data or name}.json", {**code_version(), "command": effort.command, "machine": machine(), **content})
+def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, Any]) -> None:
+    """Write a page and its data as JSON, both with commit, command and machine; the first of the lines is the title."""
+    _write(effort, name, [lines[0], "", _made_by(effort), *lines[1:]], name, content)
+
+
+def _write(effort: Effort, page: str, lines: list[str], data: str, content: dict[str, Any]) -> None:
+    (effort.out / f"{page}.md").write_text("\n".join([lines[0], "", banner([commit()], [digest()]), *lines[1:]]) + "\n")
+    write_json(effort.out / f"{data}.json", {**code_version(), "command": effort.command, "machine": machine(), **content})
+
+
+def _made_by(effort: Effort) -> str:
+    return f"Made by `{effort.command}` on {machine()}. This page is generated."
 
 
 def counts(sections: Sequence[Section]) -> Counter[str]:
@@ -49,20 +57,23 @@ def machine() -> str:
     return f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
-def _page(sections: Sequence[Section], duration: float) -> list[str]:
+def _page(sections: Sequence[Section], made_by: str) -> list[str]:
     found = counts(sections)
-    lines = ["# Results", "", f"It took {duration / 60:.0f} min, excluding flights reused from an earlier run.", "",
-             f"{found[HOLDS]} claims hold, {found[FAILS]} fail, {found[VACUOUS]} are vacuous (nothing occurred that they are "
-             f"about); {found[BETTER]} further values are better than the paper's, {found[WORSE]} worse; "
-             f"{found[MISSING]} rows are not available.", "",
+    failures = [(s.title, row.name, row.ours, row.note) for s in sections for row in s.rows if row.verdict == FAILS]
+    lines = ["# Results", "",
+             f"{found[HOLDS]} claims hold, {found[FAILS]} fail, {found[VACUOUS]} are vacuous; {found[BETTER]} further values are better than the "
+             f"paper's, {found[WORSE]} worse; {found[MISSING]} rows are not available.", "",
+             *([*table("part | row | value | claim", failures), ""] if failures else []),
+             "*holds*: the claim is true of these flights; *fails*: it is false; *vacuous*: nothing occurred that it is about; *better*, *worse*: "
+             "comparison with the paper, without a claim; *shown*: value without a claim.", "",
              "**M**: Mao et al., *Aggressive Visual Perching with Quadrotors on Inclined Surfaces*. "
              "**P**: Paneque et al., *Perception-Aware Perching on Powerlines with Multirotors*. "
-             "The papers flew in a laboratory, this is simulation: a better value here does not mean a better vehicle.", ""]
-    lines += [f"* fails: {s.title}: {row.name}: {row.ours} ({row.note})" for s in sections for row in s.rows if row.verdict == FAILS]
+             "The papers flew in a laboratory, this is simulation: a better value here does not mean a better vehicle.", "", made_by]
     for section in sections:
         lines += ["", f"## {section.title}", "", section.about, ""]
         if section.rows:
-            lines += table("| ours | paper | verdict |", ((r.name, r.ours, r.paper, _MARK.get(r.verdict, r.verdict), r.note) for r in section.rows))
+            lines += table("quantity | ours | paper | verdict | claim or note",
+                           ((r.name, r.ours, r.paper, _MARK.get(r.verdict, r.verdict), r.note) for r in section.rows))
         for name, caption in section.figures:
             lines += ["", f"![{caption}]({name})", "", f"*{caption}*"]
     return lines

@@ -42,7 +42,7 @@ def table() -> str:
         raise LookupError(f"{page}: no commit")
     missing = {"paper": "", "ours": "not evaluated", "verdict": MISSING}
     found = ((title, rows.get((key, name), missing)) for title, key, name in ROWS)
-    lines = document.table(f"of [{commit[1]}]({page}) | paper | ours | verdict", (
+    lines = document.table(f"condition ([commit {commit[1]}]({page})) | paper | ours | verdict", (
         (title, row["paper"] or "-", row["ours"], row["verdict"].lower()) for title, row in found))
     return "\n".join(lines) + "\n"
 

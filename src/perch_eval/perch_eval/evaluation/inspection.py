@@ -26,7 +26,7 @@ def inspection_sections(effort: Effort) -> list[Section]:
 def _figures(effort: Effort) -> Section:
     flight = fly(load_scenario(SCENARIO), SEED)
     out = Section("p_fig_4_5", "[P] Fig. 4 and 5: inspection with the constraints in the NMPC",
-                  f"Scenario `{SCENARIO}`, seed {SEED}, flown by the algorithm cores: plant, IMU, UKF, NMPC; VIO and the map of the cables by "
+                  f"Scenario `{SCENARIO}`, seed {SEED}, flown in one process without ROS (plant, IMU, UKF, NMPC); VIO and the map of the cables by "
                   f"their error models (map: {100 * MAP_ERROR:g} cm at each end and axis). Judged by the true lines; "
                   "a line beyond the image's corners counts as at them. "
                   "The reference is the straight lines between the waypoints.")
@@ -61,7 +61,7 @@ def _layouts(effort: Effort) -> Section:
     found = cached_figures(effort, "inspections", range(1, count + 1), fly_layout, lambda r: r["collisions"] == 0)
     out = Section("p_inspection_layouts", "[P:VI-A] Inspection over random layouts",
                   f"{count} random layouts (seeds 1 to {count}) of three cables and six waypoints, in each of which the reference collides "
-                  "twice; cores and error models as above. Without the line terms the same controller follows the reference.")
+                  "twice; flown as above, with the same error models. Without the line terms the same controller follows the reference.")
     collisions, twice = sum(r["collisions"] for r in found), sum(r["reference_collisions"] == REFERENCE_COLLISIONS for r in found)
     ended = sum(r["completed"] for r in found)
     out.claim("collisions", f"{collisions} in {count} layouts, {ended} flown to the end", "none in more than 20 experiments",

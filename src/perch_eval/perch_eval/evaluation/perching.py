@@ -86,7 +86,7 @@ def _errors(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
 
 def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
     out = Section("m_table_3", "[M] Table III: success rate",
-                  f"{_seeds_text(effort)}; a success: the vehicle is attached to the pad at the end, and the mission reports it. "
+                  f"{_seeds_text(effort).capitalize()}; a success: the vehicle is attached to the pad at the end, and the mission reports it. "
                   "95 % Wilson intervals.")
     for name, paper in SUCCESSES.items():
         rate = Rate.from_outcomes(r.cause == SUCCESS for r in groups[name])
@@ -114,7 +114,7 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
             (six, "m_fig_6.png", plots.rates_figure(view), "Body rates and tilt")):
         figure.savefig(effort.out / name, dpi=95)
         section.figures.append((name, caption))
-    five.show("outcome of seed 1", f"{trace.outcome}: {trace.message}")
+    five.show("outcome of seed 1", ": ".join(dict.fromkeys((trace.outcome, trace.message))))
     contact = [c for c in trace.contacts if c.body == "pad"]
     if contact:
         five.show("contact of seed 1", f"{contact[0].normal_speed:.2f} m/s along, {contact[0].tangential_speed:.2f} m/s across, tilt error "
@@ -137,7 +137,7 @@ def _engines() -> Section:
     from perch_eval.nodes import ALL_NODES
     from perch_eval.ros.recorded_flight import RecordedFlight
 
-    out = Section("engines", "The engine flies what the nodes fly",
+    out = Section("engines", "In process and over ROS: the same flight",
                   "surface_90, seed 1, cameras rendered: once on the real ROS 2 nodes (composed, in lockstep), once on the in-process engine "
                   "that flies the tables above.")
     mapping = {**extended_mapping("scenarios", "surface_90"),

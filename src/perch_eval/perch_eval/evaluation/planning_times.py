@@ -53,7 +53,7 @@ def _table(effort: Effort, vehicle: Vehicle) -> Section:
         printed = [found for p in problems if (found := _fastest(paper_m.plan, p, vehicle)).solved]
         out.data[f"qp_{waypoints}"] = [found.solve_time for found in printed]
         ends = Spread.from_values(1.0 * len(found.iterations) for found in printed)
-        out.claim(f"stretching violating segments and their neighbours ends, {waypoints} waypoints", f"{len(printed)} of {count}", "all",
+        out.claim(f"Algorithm 1 (stretch segments that violate the bound) ends with a plan, {waypoints} waypoints", f"{len(printed)} of {count}", "all",
                   len(printed) == count, f"every problem is solved; {ends.median:.0f} QPs in the median")
         qp = Spread.from_values(1e3 * found.solve_time for found in printed)
         out.compare(f"QP + global bound check as printed, {waypoints} waypoints", qp.to_text(1.0, 1, "ms"), f"{paper_qp:g} ms",

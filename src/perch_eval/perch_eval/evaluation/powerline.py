@@ -131,14 +131,14 @@ def _published() -> Section:
 
 def _pictures(effort: Effort) -> list[Section]:
     """Return Fig. 6 and 7 (80 deg without and with perception awareness) and Fig. 8 (upside down), as planned."""
-    seven = Section("p_fig_6_7", "[P] Fig. 6 and 7: the line in view at 80 deg", "Nominal start, as planned (flown: not available). No seed.")
-    eight = Section("p_fig_8", "[P] Fig. 8: perching upside down", "Nominal start, as planned (flown: not available). No seed.")
+    seven = Section("p_fig_6_7", "[P] Fig. 6 and 7: the line in view at 80 deg", "As planned from the nominal start; not flown.")
+    eight = Section("p_fig_8", "[P] Fig. 8: perching upside down", "As planned from the nominal start; not flown.")
     means = {}
     for case, section in (("line_80", seven), ("line_80_pa", seven), ("line_180", eight)):
         planned = problem.plan(problem.load(f"powerline_{case}"))
         assert planned.plan.perch is not None
         draw_manoeuvre(planned, effort.out / f"p_{case}.png")
-        section.figures.append((f"p_{case}.png", f"{TITLES[case]}: the manoeuvre"))
+        section.figures.append((f"p_{case}.png", f"{TITLES[case]}. Ellipse: body; short line: thrust; green: camera axis; dotted: lowest height allowed"))
         if section is seven:
             draw_visibility(planned, effort.out / f"p_{case}_visibility.png")
             section.figures.append((f"p_{case}_visibility.png", f"{TITLES[case]}: reprojection error and visibility"))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -38,6 +39,7 @@ CANCELLED_FLIGHTS = {"surface_60": 8, "surface_90": 12, "line_80": 2}  # flights
 MAX_TIME_TO_CONTACT = 1.4                                 # at which the first of them is cancelled [s]
 NO_CONTACT_BEFORE = MissionSettings().contact_early       # nearer to the contact a surface may already be touched [s]
 REQUIRED_SHARE = 0.99                                     # share of the instants before that with a way out
+INTERVAL = re.compile(r"\[(\S+), (\S+)\]")  # that was found, in a refusal
 
 
 class Instant(NamedTuple):
@@ -56,7 +58,7 @@ def sections(effort: Effort) -> list[Section]:
     jobs = [(name, seed) for name in map(str, INCLINATIONS) for seed in range(1, PLANS + 1)]
     jobs += [(name, seed) for name in LINES for seed in range(1, LINE_PLANS + 1)]
     made = cached_figures(effort, "ways_out", jobs, _plan_instants, lambda r: not r["refused"])
-    reasons: Counter[str] = Counter()
+    reasons: list[str] = []
     rows: list[tuple[object, ...]] = []
     for name in (*map(str, INCLINATIONS), *LINES):
         plans = [r for r in made if r["name"] == name]
@@ -64,7 +66,7 @@ def sections(effort: Effort) -> list[Section]:
         spans = [[x for x in instants if low <= x.time_to_contact < high] for low, high in pairwise(EDGES)]
         title = f"{name} deg" if name.isdigit() else name
         rows.append((title, *(_share(span) if span else "" for span in spans), _share(instants)))
-        reasons.update(f"{title}: {x.refusal}" for x in instants if x.refusal)
+        reasons += [f"{title}: {x.refusal}" for x in instants if x.refusal]
         early = [x for x in instants if x.time_to_contact >= NO_CONTACT_BEFORE]
         planned = sum(not r["refused"] for r in plans)
         out.claim(f"{title}: a way out {NO_CONTACT_BEFORE:g} s before contact and earlier", f"{_share(early)}; {planned} of {len(plans)} planned", "",
@@ -74,7 +76,7 @@ def sections(effort: Effort) -> list[Section]:
     text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
             *table(" | ".join(("plans", *(f"{low:g} to {high:g}" for low, high in pairwise(EDGES[:-1])), f"from {EDGES[-2]:g}", "all")), rows), "",
             "## Refused", ""]
-    text += [f"* {n}x {reason}" for reason, n in reasons.most_common()] or ["None."]
+    text += _counted(reasons) or ["None."]
     text += ["", "## Cancelled flights", "", "The goal is cancelled on the way (modelled cameras, seeds from 1). *by a way out*: the controller left the "
              "plan by a planned way out; *attached*: cancelled too late, the perch went on.", ""]
     rows = []
@@ -98,6 +100,22 @@ def sections(effort: Effort) -> list[Section]:
 def _share(instants: Sequence[Instant]) -> str:
     """Return how many of the instants have a way out, as text."""
     return f"{sum(not x.refusal for x in instants)} of {len(instants)}"
+
+
+def _counted(reasons: Iterable[str]) -> list[str]:
+    """Return reasons with their counts as a list; reasons that differ in an interval only count as one, with the range of each end."""
+    found: dict[tuple[str, ...], list[list[str]]] = {}
+    for reason in reasons:
+        before, *ends = INTERVAL.split(reason, maxsplit=1)  # both ends and the text after them, or nothing
+        found.setdefault((before, *ends[2:]), []).append(ends[:2])
+    return [f"* {len(ends)}x " + f"[{', '.join(map(_span, zip(*ends)))}]".join(text)
+            for text, ends in sorted(found.items(), key=lambda item: -len(item[1]))]
+
+
+def _span(numbers: Iterable[str]) -> str:
+    """Return the range of some numbers as text; a number itself if there is no other."""
+    ordered = sorted(set(numbers), key=float)
+    return ordered[0] if len(ordered) == 1 else f"{ordered[0]} to {ordered[-1]}"
 
 
 def _cancellations() -> Iterator[tuple[str, int, float]]:

@@ -139,9 +139,9 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     unaffected = [row for row in struck if without_effect(row)]
     reported = [row for row in struck if row["named"] is not None and row["named"] <= REPORT_LIMIT]
     clean = [row for row in rows if not row["left"]]
-    commits = Counter(row["commit"] for row in rows)
+    commits, others = Counter(row["commit"] for row in rows), sum(bool(row["ended"]) for row in rows)
     text = ["# Faults on the real graph", "", banner(commits, [row.get("code", "") for row in rows]), "",
-            "Made by `python3 scripts/faults.py`; edit nothing here. Rows: [rows.jsonl](rows.jsonl).", "",
+            "Made by `python3 scripts/faults.py`. This page is generated. Rows: [rows.jsonl](rows.jsonl).", "",
             f"{len(rows)} of {len(cases())} flights of `surface_90` at " + ", ".join(f"{name} ({n})" for name, n in commits.items())
             + f" on {machine()}.", "",
             f"* **{len(safe)} of {len(struck)} end safely**: hovering, landed, perched, or with the motors off on the ground.",
@@ -151,7 +151,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             f"* **{len(clean)} of {len(rows)} leave no residue**: no process, no socket of the lockstep, no shared memory in the end.",
             f"* {hard_impacts.total()} of those that end safely hit the floor with more than {FALL_SPEED:g} m/s"
             + (f"; struck were: {', '.join(f'{node} ({n})' for node, n in hard_impacts.items())}." if hard_impacts else "."),
-            f"* In {sum(bool(row['ended']) for row in rows)} flights a node that was not struck ended.",
+            f"* In {others} flights a node that was not struck ended." if others else "* No other node ended in any flight.",
             "", "The node that is struck has a process of its own. In a quarter of the flights all others have, too; in the rest those",
             "that do not use images share one, as in `demo.py`. Cameras are off; VIO and tags are replaced by their error models",
             "(`perch_eval.modelled_sight_node`). Processes are forked from one that has loaded the code: a restart is quick.",
@@ -166,10 +166,10 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
         nodes = list(dict.fromkeys(case.node for case in cases() if case.mode == mode))
         ends = [(fault, *(_ends([row for row in rows if (row["fault"], row["node"], row["mode"]) == (fault, node, mode)]) for node in nodes))
                 for fault in FAULTS]
-        text += [f"## Ends, {mode}", "", *table(" | ".join(("fault", *nodes)), (row for row in ends if any(row[1:]))), ""]
+        text += [f"## How flights ended, {mode}", "", *table(" | ".join(("fault", *nodes)), (row for row in ends if any(row[1:]))), ""]
     times = sorted(row["named"] for row in struck if row["named"] is not None)
     if times:
-        text += [f"Named after: median {times[len(times) // 2]:.1f} s, worst {times[-1]:.1f} s.", ""]
+        text += [f"Time until the fault was named: median {times[len(times) // 2]:.1f} s, worst {times[-1]:.1f} s.", ""]
     bad = [f"* **{row['fault']} {row['node']}, {row['phase']}, {row['mode']}** (seed {row['seed']}): {'; '.join(problems(row))}. "
            f"Goal: {row['goal']}" for row in rows if problems(row)]
     text += ["## Failed flights", "", *(bad or ["None."])]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from perch_core import so3
 from perch_core.vehicle import Vehicle
@@ -17,8 +19,9 @@ from perch_eval.metrics import tilt_degrees
 
 AZIMUTH, ELEVATION = math.radians(-68.0), math.radians(12.0)  # of the observer, from the direction of flight
 LABEL = 0.12           # between instants that both have one [m]
+PLACES = (((0.0, -0.5 * PAD), "center", "top"), ((-0.8 * PAD, 0.0), "right", "center"), ((0.8 * PAD, 0.0), "left", "center"))
+"""Of a label, in order of preference: offset from the body's centre in the picture [m], horizontal and vertical alignment."""
 DISC = np.linspace(0.0, 2.0 * math.pi, 25)
-DOWN = np.array([0.0, 0.0, -1.0])
 
 
 def stroboscope(view: FlightView, start: float, end: float, instants: int = 10) -> Figure:
@@ -42,18 +45,44 @@ def stroboscope(view: FlightView, start: float, end: float, instants: int = 10) 
     colors = colormaps["viridis"](np.linspace(0.0, 0.85, instants))
     states = view.truth.at(times)
     tilts = tilt_degrees(states.q)
-    for k, (p, q) in enumerate(zip(states.p, states.q)):
-        R = so3.quat_to_matrix(q)
-        draw_vehicle(axes, view.vehicle, p, R, observer, colors[k], 3 + k)
-        if k == instants - 1 or np.linalg.norm(states.p[k + 1] - p) > LABEL:
-            axes.annotate(f"{times[k] - end:+.2f} s, {tilts[k]:.0f}°", tuple(project(p + 0.5 * PAD * DOWN)), ha="center", va="top",
-                          fontsize=7, color="0.25", zorder=50,
-                          bbox={"facecolor": "white", "alpha": 0.75, "linewidth": 0.0, "pad": 0.5})
+    bodies = [draw_vehicle(axes, view.vehicle, p, so3.quat_to_matrix(q), observer, colors[k], 3 + k) for k, (p, q) in enumerate(zip(states.p, states.q))]
     left, low = project(flown.p).min(axis=0) - [0.1, 0.3]
     axes.plot([left, left + 0.5], [low, low], color="k", lw=2.0)
     axes.annotate("0.5 m", (left + 0.25, low - 0.02), ha="center", va="top", fontsize=8)
     axes.autoscale_view()
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # the places of the labels are chosen in this layout
+    taken = [(k, box_of(part)) for k, body in enumerate(bodies) for part in body]
+    for k in reversed(range(instants)):  # the contact has the first choice
+        if k == instants - 1 or np.linalg.norm(states.p[k + 1] - states.p[k]) > LABEL:
+            text = f"{times[k] - end:+.2f} s, {tilts[k]:.0f}°"
+            taken += [(-1, box) for box in draw_label(axes, text, project(states.p[k]), [box for n, box in taken if n != k])]
     return figure
+
+
+def box_of(part: Any) -> Bbox:
+    """Return the bounding box of a line or a disc in the figure's layout [px]."""
+    transform = part.axes.transData
+    return part.get_datalim(transform).transformed(transform) if isinstance(part, PolyCollection) else part.get_window_extent()
+
+
+def draw_label(axes: Any, text: str, centre: np.ndarray, taken: Sequence[Bbox]) -> list[Bbox]:
+    """Label a body where the label covers nothing else. Return the label's box; empty: there is no such place, and no label.
+
+    Args:
+        axes: of the picture.
+        text: of the label.
+        centre: of the body in the picture [m], shape (2,).
+        taken: boxes that must not be covered [px].
+    """
+    for offset, horizontal, vertical in PLACES:
+        label = axes.annotate(text, tuple(centre + offset), ha=horizontal, va=vertical, fontsize=7, color="0.25", zorder=50,
+                              bbox={"facecolor": "white", "alpha": 0.75, "linewidth": 0.0, "pad": 0.5})
+        box = label.get_window_extent()
+        if (box.min > 0.0).all() and (box.max < axes.figure.bbox.max).all() and not box.count_overlaps(taken):
+            return [box]
+        label.remove()
+    return []
 
 
 class Observer:

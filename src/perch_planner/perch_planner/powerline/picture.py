@@ -104,9 +104,9 @@ def draw_visibility(planned: PlannedProblem, path: Path, without: Manoeuvre | No
         top.plot(part.times, np.where(metrics.cheirality, np.minimum(metrics.reprojection, 2000), np.nan), color=colour, label=label)
         middle.plot(part.times, metrics.in_image, color=colour)
         bottom.plot(part.times, np.where(metrics.segment & metrics.cheirality, 1, 0), color=colour)
-    top.set(ylabel="|reprojection| [px]", yscale="symlog", title=planned.problem.name)
+    top.set(ylabel="|reprojection| [px]", yscale="symlog", title=planned.problem.description or planned.problem.name)
     top.legend(fontsize=8)
-    middle.set(ylabel="share of segment in image", ylim=(-0.05, 1.05))
+    middle.set(ylabel="share in\nimage", ylim=(-0.05, 1.05))
     bottom.set(xlabel="time [s]", ylabel="constraints (12), (13)", yticks=[0, 1], yticklabels=["violated", "hold"], ylim=(-0.1, 1.1))
     figure.savefig(path, dpi=130)
 
