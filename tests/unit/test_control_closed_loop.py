@@ -9,6 +9,9 @@ import pytest
 
 from closed_loop.loop import fly_to_contact, make_loop, perch, predictive
 from closed_loop.plant import EstimationError
+from perch_control.parameters import ControllerParameters
+from perch_core.config import from_mapping
+from perch_core.errors import ConfigError
 from perch_control.admission import AtEnd, TrajectoryRefused
 from perch_control.modes import Command, State
 from perch_core.trajectory import rest_to_rest
@@ -163,3 +166,9 @@ def test_estimation_errors_do_not_shake_the_hover():
     loop.run(2.0)
     assert np.all(loop.rmse < 0.04)
     assert isinstance(loop.odometry, EstimationError)
+
+
+@pytest.mark.parametrize("rate", [(0.0, 32.0, 10.0), (32.0, -1.0, 10.0)])
+def test_gains_without_damping_are_refused(rate):
+    with pytest.raises(ConfigError, match="gains.rate"):
+        from_mapping(ControllerParameters, {"gains": {"rate": list(rate)}}, "test")

@@ -123,7 +123,7 @@ class ControlGains:
     position: Vector3 = quantity((7.0, 7.0, 9.0), unit="1/s^2", low=0.0, high=200.0, doc="axes of W")
     velocity: Vector3 = quantity((4.5, 4.5, 5.5), unit="1/s", low=0.0, high=100.0, doc="axes of W")
     attitude: Vector3 = quantity((420.0, 420.0, 60.0), unit="1/s^2", low=0.0, high=5000.0, doc="axes of B")
-    rate: Vector3 = quantity((32.0, 32.0, 10.0), unit="1/s", low=0.0, high=500.0, doc="axes of B")
+    rate: Vector3 = quantity((32.0, 32.0, 10.0), unit="1/s", above=0.0, high=500.0, doc="axes of B")
     lead: float = quantity(0.02, unit="s", low=0.002, high=0.2, doc="time in which the rotors would reach a constant commanded thrust")
 
 
