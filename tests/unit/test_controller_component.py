@@ -142,7 +142,8 @@ def test_odometry_that_cannot_be_used_is_answered_bridged_and_then_descended_wit
     flight = hovering()
     count = len(flight.motors)
     flight.step(0.04, **changes)
-    assert len(flight.motors) == count + 20 and flight.state is State.HOVERING and "refused" in flight.said
+    assert len(flight.motors) == count + 20 and flight.state is State.HOVERING
+    assert [line.level for line in flight.lines if "refused" in line.text] == ["warning"]
     flight.step(0.04, **changes)
     assert len(flight.motors) == count + 40 and flight.state is State.LANDING
 

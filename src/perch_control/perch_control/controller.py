@@ -258,7 +258,7 @@ class Controller(Component[ControllerParameters]):
             self.attitude_thrust(AttitudeThrust(stamp, result.armed, loop.q_WB, loop.w_B, loop.thrust))
         self._steps += 1
         if result.event:
-            self.info(result.event)
+            (self.warn if self.flight.odometry_refusal else self.info)(result.event)
         now = max(stamp, self._stamps.newest)  # stamps of odometry may stand still
         if self._first is None:
             self._first = now

@@ -85,6 +85,11 @@ class FlightController:
         return self._inputs.age
 
     @property
+    def odometry_refusal(self) -> str:
+        """Why the last odometry sample was refused; empty: it was accepted."""
+        return self._inputs.refusal
+
+    @property
     def health(self) -> RotorHealth:
         """Health of the rotors."""
         return self._thrust.health

@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
+from perch_planner.perching_planner import TIME_LIMIT_MAX
 from perch_sim.lockstep import flight_tasks
 from perch_sim.scenario import NODES, Latency, Scenario
 
@@ -23,7 +24,6 @@ PARTICIPANTS = frozenset(flight_tasks(Latency()))
 """Nodes that take part in the simulator's lockstep."""
 ALWAYS = ("description",)
 """Nodes that are started with every scenario."""
-LOCKSTEP_PLAN_TIMEOUT = 45.0  # wall-clock limit of a plan for which simulation time waits [s]
 HOST_PARAMETERS = ("lockstep", "lockstep_hold", "use_sim_time")
 """Parameters of a node's host; they are not passed to its component."""
 
@@ -180,7 +180,7 @@ def _scenario_parameters(scenario: Scenario, nodes: Sequence[str], seed: int, so
                "mission.powerline_latency": scenario.latency.powerline_planner}
     controller: dict[str, Any] = dict(vehicle)
     # in lockstep simulation time waits: what is flown depends on no processor
-    planner = vehicle | ({"time_limit": LOCKSTEP_PLAN_TIMEOUT} if lockstep else {})
+    planner = vehicle | ({"time_limit": TIME_LIMIT_MAX} if lockstep else {})
     if scenario.mode == "inspection":
         mission |= {"mission.waypoints": [v for w in scenario.inspection.waypoints for v in (*w.position, w.yaw_deg)],
                     "mission.inspection_speed": scenario.inspection.speed}

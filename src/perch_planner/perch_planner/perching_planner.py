@@ -44,12 +44,15 @@ class PerchPlanError(IntEnum):
     TIME_LIMIT = 8
 
 
+TIME_LIMIT_MAX = 45.0  # largest `time_limit`: less than a client waits for an answer [s]
+
+
 @dataclass(frozen=True, kw_only=True)
 class PerchingPlannerParameters(PerchParameters):
     """Parameters of the component: those of the planner, and the vehicle it plans for."""
 
     vehicle: str = text("snapdragon", doc="config/vehicles/<name>.yaml, or a file")
-    time_limit: float = quantity(2.0, unit="s", above=0.0, high=45.0, doc="wall-clock limit of a plan, from the request on")
+    time_limit: float = quantity(2.0, unit="s", above=0.0, high=TIME_LIMIT_MAX, doc="wall-clock limit of a plan, from the request on")
 
     @property
     def settings(self) -> PerchSettings:
