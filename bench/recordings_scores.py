@@ -59,19 +59,68 @@ WIRES_SEEN = {
 # -- recordings with an IMU ------------------------------------------------------------------------------------------
 
 
+EUROC_PERIOD = 5_000_000  # of its IMU [ns]
+
+
 def run_perceive(recording: Path, *options: str) -> tuple[Figures, str]:
     """Run `scripts/perceive.py` on a recording; return its `report.json`, without times and text, and `report.html`."""
     with tempfile.TemporaryDirectory() as out:
         if command.main([str(recording), "--out", out, *options]):
             raise PerchError(f"{recording}: perceive.py failed")
         report, page = json.loads((Path(out) / "report.json").read_text()), (Path(out) / "report.html").read_text()
-    kept = {key: report[key] for key in ("images", "frames", "restarts", "vio", "estimator", "target", "powerlines")}
+    kept = {key: report[key] for key in ("images", "frames", "restarts", "vio", "estimator", "target", "powerlines") if key in report}
     return kept | {"gyro_bias": report["sensors"]["gyro_bias"]}, page
 
 
 def euroc(recording: Path, truth: Path) -> Figures:
     """Score a EuRoC folder against a truth file."""
     return run_perceive(recording, "--truth", str(truth))[0]
+
+
+def euroc_of_parts(images: Path, imu: Path, truth: Path) -> Figures:
+    """Score images, IMU and truth of one EuRoC sequence that are in three places.
+
+    Args:
+        images: folder with `cam0`.
+        imu: folder with `data.csv`; its stamps may be rounded: they are put back on the grid of the images' stamps.
+        truth: file of the true motion.
+    """
+    names = [line.partition(",")[0] for line in (images / "cam0" / "data.csv").read_text().splitlines() if line[:1].isdigit()]
+    rows = [line.partition(",") for line in (imu / "data.csv").read_text().splitlines() if line[:1].isdigit()]
+    first = int(names[0])
+    with tempfile.TemporaryDirectory() as name:
+        parts = Path(name) / "mav0"
+        (parts / "imu0").mkdir(parents=True)
+        (parts / "cam0").symlink_to((images / "cam0").resolve())
+        (parts / "imu0" / "sensor.yaml").symlink_to((imu / "sensor.yaml").resolve())
+        (parts / "imu0" / "data.csv").write_text("".join(
+            f"{first + round((float(stamp) - first) / EUROC_PERIOD) * EUROC_PERIOD},{values}\n" for stamp, _, values in rows))
+        return euroc(Path(name), truth)
+
+
+def dm_vio(folder: Path) -> Figures:
+    """Score a recording in DM-VIO's format, with its own calibration, as its README and `sensors.py check` tell: clock and pixel noise."""
+    camera, imu = np.loadtxt(folder / "cam0" / "camera.txt", max_rows=1), np.loadtxt(folder / "imu.txt")
+    T_CI = np.array(yaml.safe_load((folder / "camchain.yaml").read_text())["cam0"]["T_cam_imu"])
+    width, height = np.loadtxt(folder / "cam0" / "camera.txt", skiprows=1, max_rows=1, dtype=int).tolist()
+    sensors = {"name": "l515", "cameras": {"cam0": {
+        "model": "pinhole", "width": width, "height": height, "focal": camera[:2].tolist(), "centre": camera[2:4].tolist(),
+        "position": (-T_CI[:3, :3].T @ T_CI[:3, 3]).tolist(), "orientation": so3.quat_from_matrix(so3.nearest(T_CI[:3, :3].T)).tolist(),
+        "rate": 17.0, "stamp_offset": 0.04}},
+        "imu": {"rate": 200.0, "accel_noise_density": 1e-2, "gyro_noise_density": 1e-3, "accel_bias_walk": 1e-3, "gyro_bias_walk": 2e-5}}
+    stamps = [line.split()[0] for line in (folder / "imu.txt").read_text().splitlines() if line[:1].isdigit()]
+    with tempfile.TemporaryDirectory() as name:
+        parts = Path(name) / "mav0"
+        (parts / "imu0").mkdir(parents=True)
+        (parts / "cam0").mkdir()
+        (parts / "cam0" / "data").symlink_to((folder / "cam0" / "images").resolve())
+        (parts / "cam0" / "data.csv").write_text("".join(
+            f"{file.stem},{file.name}\n" for file in sorted((folder / "cam0" / "images").iterdir())))
+        (parts / "imu0" / "data.csv").write_text("".join(
+            f"{stamp},{','.join(map(repr, row))}\n" for stamp, row in zip(stamps, imu[:, 1:7].tolist())))
+        (Path(name) / "sensors.yaml").write_text(yaml.safe_dump(sensors))
+        return run_perceive(Path(name), "--sensors", str(Path(name) / "sensors.yaml"), "--without", "target_localizer", "powerline_mapper",
+                            "-p", "vio.filter.pixel_noise:=1.0")[0]
 
 
 def photographed_floor(tests: Path, out: Path) -> Figures:

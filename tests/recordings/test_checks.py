@@ -113,6 +113,20 @@ def test_clock_and_mounting_are_told_by_the_turns(late, R, size, level, words):
         assert found["camera cam0 mounting"].level == ("fails" if turned else "ok")
 
 
+@pytest.mark.parametrize("factor, matches", [(1.6, True), (57.3, False)], ids=["close scene", "deg/s"])
+def test_a_close_scene_changes_the_size_of_the_turns_and_no_more(factor, matches):
+    """Translation adds to what looks like a turn: correlated with the gyro's, larger, and noisy."""
+    rng, t = np.random.default_rng(7), np.arange(0.0, 30.0, 0.005)
+    gyro = 0.4 * np.stack([np.sin(2.0 * t), np.cos(3.0 * t), 0.2 * np.sin(t)], axis=1)
+    begin = np.arange(10.0, 18.0, 0.05)
+    seen = np.array([gyro[(t > b - 0.001) & (t < b + 0.051)].mean(axis=0) for b in begin])
+    report = Report()
+    camera_check._check_clock(report, "cam0", np.column_stack([begin, begin + 0.05, factor * seen + 0.25 * rng.standard_normal(seen.shape)]),
+                              t, gyro, 0.0)
+    text = next(f.text for f in report.findings if f.about == "camera cam0 clock")
+    assert ("does not match" not in text) == matches, text
+
+
 def test_the_command_says_it_by_its_exit_code(files, capsys):
     assert sensors_command.main(["check", str(files / "mcap"), "--sensors", str(files / "mine.yaml")]) == 0
     told = capsys.readouterr().out

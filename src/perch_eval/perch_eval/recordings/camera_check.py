@@ -22,6 +22,7 @@ SPAN = 8.0  # of the interval that is evaluated [s]
 OFFSETS = np.arange(-0.5, 0.501, 0.002)  # of the images' stamps that are tried [s]
 MIN_RATE_SIGMA = 0.2  # least 1 sigma of usable rates [rad/s]
 MATCHING, MISMATCHING = 0.25, 0.7  # share of the images' rotation that the gyro does not explain: below, they match, above, they do not
+MAX_FACTOR = 3.0  # between the two in one unit
 
 
 class ImageStatistics:
@@ -136,12 +137,13 @@ def _check_clock(report: Report, name: str, turns: np.ndarray, stamps: np.ndarra
     offset, sigma = clock_offset(rate, gyro_rate, 0.5 * (turns[:, 0] + turns[:, 1]))
     if sigma > 0.01:
         spread = gyro_rate.std(axis=1).mean(axis=0)
-        share = ((rate - gyro_rate).std(axis=1) / gyro_rate.std(axis=1)).min(axis=0)
-        if (spread > MIN_RATE_SIGMA).any() and share[spread > MIN_RATE_SIGMA].min() > MISMATCHING:
+        usable = spread > MIN_RATE_SIGMA
+        if usable.any() and unexplained(rate, gyro_rate)[usable].min() > MISMATCHING:
             report.add(f"camera {name} clock", f"the rotation of the images does not match the gyro's at any offset up to {OFFSETS[-1]:g} s: "
                        "clock, axes or unit are wrong, or the scene moves", warning=True, fails=bool(spread[2] > MIN_RATE_SIGMA))
         else:
-            report.add(f"camera {name} clock", f"rotation is too slow to compare it with the IMU's ({1e3 * sigma:.0f} ms, 1 sigma)")
+            report.add(f"camera {name} clock", "rotation is too slow, or the scene too close, to compare it with the IMU's "
+                       f"({1e3 * sigma:.0f} ms, 1 sigma)")
         return
     report.figures[f"{name}_stamp_offset_s"] = offset
     beyond, edge = abs(offset - nominal) - 3.0 * sigma, abs(offset) > OFFSETS[-2]
@@ -185,6 +187,18 @@ def mounting(rate: np.ndarray, gyro_rate: np.ndarray) -> tuple[np.ndarray, float
         return np.eye(3), np.inf
     found = [(R := so3.nearest(one.T @ rate), float(np.linalg.norm(one - rate @ R.T) / np.linalg.norm(rate))) for one in gyro_rate]
     return min(found, key=lambda pair: pair[1])
+
+
+def unexplained(rate: np.ndarray, gyro_rate: np.ndarray) -> np.ndarray:
+    """Return the share of the camera's rates about each axis that the gyro's, times a factor, do not explain, shape (3,).
+
+    Translation close to the scene changes the factor. One above `MAX_FACTOR`, or below its inverse, is another unit: it explains
+    nothing. For the arguments see `clock_offset`.
+    """
+    rate, gyro_rate = rate - rate.mean(axis=0), gyro_rate - gyro_rate.mean(axis=1, keepdims=True)
+    factor = (rate * gyro_rate).sum(axis=1) / np.maximum((gyro_rate**2).sum(axis=1), 1e-12)
+    share = np.linalg.norm(rate - factor[:, None] * gyro_rate, axis=1) / np.maximum(np.linalg.norm(rate, axis=0), 1e-12)
+    return np.where((factor > 1.0 / MAX_FACTOR) & (factor < MAX_FACTOR), share, 1.0).min(axis=0)
 
 
 def clock_offset(rate: np.ndarray, gyro_rate: np.ndarray, times: np.ndarray) -> tuple[float, float]:

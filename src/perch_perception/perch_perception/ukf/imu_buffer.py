@@ -18,6 +18,36 @@ _PERIODS = 9  # last intervals whose median is the period
 _MAX_SQUARE = 1e8  # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
 
 
+_NOISE_WINDOW = 0.25  # time constant of the measured noise [s]
+_MIN_NOISE = 0.1  # least measured variance that is believed, as a share of the sensor file's: that of one that is not shaken
+
+
+class MeasuredNoise:
+    """Variance of one sample of a sensor, from its samples' third differences.
+
+    A smooth motion vanishes in them, while white noise of variance s^2 gives 20 s^2 (von Neumann et al. 1941, for first differences).
+    The airframe's vibration counts as noise. The sensor file's noise holds until samples show another.
+    """
+
+    def __init__(self, density: float) -> None:
+        """`density`: of the sensor's noise, as in the sensor file [unit/sqrt(Hz)]."""
+        self._density2, self._variance = density**2, 0.0
+        self._last: tuple[tuple[float, ...], ...] = ()  # the last three samples
+
+    def add(self, x: tuple[float, ...], dt: float, after_gap: bool) -> tuple[float, float]:
+        """Add a sample (3,), `dt` [s] after the last one; return the measured variance, and that of the sensor file."""
+        declared = self._density2 / dt
+        if not self._variance:
+            self._variance = declared
+        last = () if after_gap else self._last
+        if len(last) == 3:
+            a, b, c = last
+            i, j, k = x[0] - a[0] + 3.0 * (b[0] - c[0]), x[1] - a[1] + 3.0 * (b[1] - c[1]), x[2] - a[2] + 3.0 * (b[2] - c[2])
+            self._variance += min(dt / _NOISE_WINDOW, 1.0) * ((i * i + j * j + k * k) / 60.0 - self._variance)
+        self._last = (*last[-2:], x)
+        return max(self._variance, _MIN_NOISE * declared), declared
+
+
 def is_sane(sample: ImuSample) -> bool:
     """Whether a sample is finite and within the range of any real IMU."""
     (a, b, c), (x, y, z) = sample.w_B, sample.f_B
@@ -42,18 +72,19 @@ class ImuOutcome(enum.Enum):
 class ImuBuffer:
     """Integration steps between IMU samples over at least the last `history` seconds.
 
-    Step k leads from sample k-1 to sample k and is a row (dt, gyro, accel, gyro variance, accel variance). The IMU's period is
-    measured as the median of the last intervals.
+    Step k leads from sample k-1 to sample k and is a row (dt, gyro, accel, gyro variance, accel variance). The variance is the
+    measured one. The IMU's period is the median of the last intervals.
     """
 
     def __init__(self, imu: ImuNoise, history: float) -> None:
         self._imu = imu
         self._instant = imu.integration == "instant"
-        self._densities = (imu.gyro_noise_density**2, imu.accel_noise_density**2)
+        self._gyro, self._accel = MeasuredNoise(imu.gyro_noise_density), MeasuredNoise(imu.accel_noise_density)
         self._keep = round(history * 1e9)
         self._intervals: deque[int] = deque(maxlen=_PERIODS)
         self._ends: list[int] = []
         self._rows: list[tuple[float, ...]] = []
+        self._sensor_noise: list[tuple[float, float]] = []  # of the rows: gyro variance, accel variance without vibration
         self.last: ImuSample | None = None
 
     @property
@@ -87,21 +118,23 @@ class ImuBuffer:
             u, g = last.w_B, last.f_B
             w = (0.5 * (w[0] + u[0]), 0.5 * (w[1] + u[1]), 0.5 * (w[2] + u[2]))
             f = (0.5 * (f[0] + g[0]), 0.5 * (f[1] + g[1]), 0.5 * (f[2] + g[2]))
-        gyro, accel = self._densities[0] / dt, self._densities[1] / dt
-        if self._is_gap(interval):
+        is_gap = self._is_gap(interval)
+        (gyro, gyro_alone), (accel, accel_alone) = self._gyro.add(sample.w_B, dt, is_gap), self._accel.add(sample.f_B, dt, is_gap)
+        more_gyro = more_accel = 0.0
+        if is_gap:
             # the error persists over the gap: its variance must not average out over the one long step
-            gyro, accel = gyro + _GAP_GYRO**2, accel + _GAP_ACCEL**2
-            outcome = ImuOutcome.GAP
+            more_gyro, more_accel, outcome = _GAP_GYRO**2, _GAP_ACCEL**2, ImuOutcome.GAP
         ends = (sample, last) if self._instant else (sample,)  # what the step is made of
         if max(abs(x) for s in ends for x in s.w_B) >= 0.99 * imu.gyro_range:
-            gyro, outcome = gyro + imu.gyro_range**2, ImuOutcome.SATURATED  # it may be off by as much again
+            more_gyro, outcome = more_gyro + imu.gyro_range**2, ImuOutcome.SATURATED  # it may be off by as much again
         if max(abs(x) for s in ends for x in s.f_B) >= 0.99 * imu.accel_range:
-            accel, outcome = accel + imu.accel_range**2, ImuOutcome.SATURATED
+            more_accel, outcome = more_accel + imu.accel_range**2, ImuOutcome.SATURATED
         self._ends.append(sample.stamp)
-        self._rows.append((dt, *w, *f, gyro, accel))
+        self._rows.append((dt, *w, *f, gyro + more_gyro, accel + more_accel))
+        self._sensor_noise.append((gyro_alone + more_gyro, accel_alone + more_accel))
         if sample.stamp - self._ends[0] >= 2 * self._keep:
             old = max(bisect_right(self._ends, sample.stamp - self._keep), 1)
-            del self._ends[:old], self._rows[:old]
+            del self._ends[:old], self._rows[:old], self._sensor_noise[:old]
         return outcome
 
     def _is_gap(self, interval: int) -> bool:
@@ -120,8 +153,10 @@ class ImuBuffer:
         """1 sigma of the newest gyro sample [rad/s]; 0 before the second."""
         return float(np.sqrt(self._rows[-1][7])) if self._rows else 0.0
 
-    def run(self, start: int, end: int) -> np.ndarray:
+    def run(self, start: int, end: int, sensor_noise: bool = False) -> np.ndarray:
         """Return the steps from stamp `start` to stamp `end` [ns], the first and last cut to fit, shape (m, 9).
+
+        With `sensor_noise`, the variances are those of the sensor file.
 
         The variances of a cut step are multiplied by the ratio of the whole duration to the remaining one. The two parts of a
         step, used in two runs, then add up to the noise of the whole step.
@@ -133,6 +168,8 @@ class ImuBuffer:
         rows = np.array(self._rows[first : last + 1]).reshape(-1, 9)
         if len(rows) == 0:
             return rows
+        if sensor_noise:
+            rows[:, 7:] = self._sensor_noise[first : last + 1]
         begins = self._ends[first] - round(rows[0, 0] * 1e9)
         whole = rows[[0, -1], 0]
         rows[0, 0] -= max(0, start - begins) * 1e-9

@@ -71,4 +71,4 @@ def _excess_means(steps: np.ndarray, biases: np.ndarray | None, known: np.ndarra
 
 def window(imu: ImuBuffer, end: int) -> np.ndarray:
     """Return the steps over which rest at a stamp `end` [ns] is tested, shape (m, 9)."""
-    return imu.run(max(imu.oldest, end - round(WINDOW * 1e9)), end)
+    return imu.run(max(imu.oldest, end - round(WINDOW * 1e9)), end, sensor_noise=True)

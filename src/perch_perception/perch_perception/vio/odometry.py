@@ -36,6 +36,7 @@ _MAX_BLIND_NO_TRACKS = 0.15  # longest time without a visual update where nothin
 _MAX_BLIND = 0.5  # the same while features are tracked [s]
 _MAX_BLIND_TAKE_OFF = 1.0  # the same at a take-off, from rest on [s]
 _MAX_TAKE_OFF_SIGMA = 0.05  # largest 1 sigma of the velocity in a blind take-off [m/s]
+_UNSEEN_SPEED = 1.0  # of a vehicle that left its place while there were no images [m/s]
 _DIVERGENCE_FRAMES = 15  # frames over which observations that are refused and used are counted
 _MAX_STAMP_LEAD = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
 _KEPT_ODOMETRY = 200  # values: 0.4 s at 500 Hz, longer than an image takes
@@ -148,7 +149,7 @@ class VisualInertialOdometry:
             return VioResult(problem, restarts=self.restarts, message=f"frame {stamp} ns {problem.value}")
         self._last_image = stamp
         if self._last_exposure is not None and self._last_exposure < self._imu.oldest:
-            self._resume()
+            self._resume(exposure)
         features = self._track(image, exposure)
         self._frame += 1
         if self.filter is None:
@@ -170,14 +171,15 @@ class VisualInertialOdometry:
             return FrameOutcome.FUTURE
         return FrameOutcome.TOO_OLD if exposure < self._imu.oldest else None
 
-    def _resume(self) -> None:
+    def _resume(self, exposure: int) -> None:
         """Restart from the last known pose after a gap in the images that is longer than the IMU history.
 
-        A vehicle at rest is assumed to rest there still. One in motion may have turned by any angle.
+        A vehicle that rested before the gap, and whose IMU is at rest after it, rests there still. Another may have turned by any angle.
         """
-        moved = self._known_at is not None or (self.filter is not None and not self._at_rest)
+        left = self._at_rest and not is_at_rest(window(self._imu, exposure))
+        moved = left or self._known_at is not None or (self.filter is not None and not self._at_rest)
         if self.filter is not None:
-            self._drop_filter()
+            self._drop_filter(_UNSEEN_SPEED if left else 0.0)
         if moved:
             covariance = self._known_pose.covariance.copy()
             covariance[3, :3] = covariance[:3, 3] = 0.0
@@ -317,7 +319,7 @@ class VisualInertialOdometry:
         while len(self._views) > 1 and self._views[1][0] <= state.stamp:
             self._views.popleft()
         return self._result(FrameOutcome.RESTING, features, FrameReport(),
-                            rest.propagated_to(filter, self._imu.run(until, exposure), exposure, noise_factor))
+                            rest.propagated_to(filter, self._imu.run(until, exposure, sensor_noise=True), exposure, noise_factor))
 
     def _add_ground_landmarks(self, floor: float, features: Features) -> None:
         """Make ground features that were seen at rest, and still are, the first landmarks."""
@@ -356,10 +358,10 @@ class VisualInertialOdometry:
         self._drop_filter()
         return VioResult(FrameOutcome.LOST, None, len(features.ids), restarts=self.restarts, message=f"lost: {why}")
 
-    def _drop_filter(self) -> None:
+    def _drop_filter(self, least_speed: float = 0.0) -> None:
         self._store_pose()
         s = self._running.state
-        speed = float(np.linalg.norm(s.v_WB))
+        speed = max(float(np.linalg.norm(s.v_WB)), least_speed)
         self._known_at = s.stamp, speed if speed < SPEED_MAX else SPEED_MAX
         self._begin_motion_start()
         self.filter, self._at_rest, self._at_configured_start, self.restarts = None, False, False, self.restarts + 1
