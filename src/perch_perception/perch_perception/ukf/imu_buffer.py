@@ -16,8 +16,6 @@ _GAP_ACCEL = 5.0  # 1 sigma of what a missing sample may have been [m/s^2]
 _GAP_GYRO = 2.0  # the same [rad/s]
 _PERIODS = 9  # last intervals whose median is the period
 _MAX_SQUARE = 1e8  # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
-
-
 _NOISE_WINDOW = 0.25  # time constant of the measured noise [s]
 _MIN_NOISE = 0.1  # least measured variance that is believed, as a share of the sensor file's: that of one that is not shaken
 
