@@ -77,7 +77,7 @@ def bench(monkeypatch):
 
 def test_a_page_without_recordings_says_so(bench):
     page = "\n".join(bench.page({}, "a command"))
-    assert page.count(bench.MISSING) == 16 and all(recording.title in page for recording in bench.RECORDINGS.values())
+    assert page.count(bench.MISSING) == 18 and all(recording.title in page for recording in bench.RECORDINGS.values())
 
 
 @pytest.mark.parametrize("errors, verdict", [([0.1, 0.2], "holds (2 of 2)"), ([0.1, 0.21, 0.3], "fails (1 of 3)")])

@@ -56,7 +56,9 @@ def test_the_covariance_does_not_grow_and_is_honest(attitude, minutes):
     resting = Resting(attitude=attitude).run(10.0)
     before = resting.sigma
     resting.run(60.0 * minutes - 10.0)
-    np.testing.assert_allclose(resting.sigma[:9], before[:9], rtol=0.02)
+    pose, velocity = np.r_[0:3, 6:9], slice(3, 6)
+    np.testing.assert_allclose(resting.sigma[pose], before[pose], rtol=0.02)
+    np.testing.assert_allclose(resting.sigma[velocity], before[velocity], rtol=0.3)  # of the last 0.1 s of noise, as measured over 25 samples
     assert resting.sigma[9:12].max() < 0.001 and resting.sigma[:3].max() < 0.031
     assert np.linalg.norm(resting.error[:3]) < 0.12 and np.abs(resting.error[9:12]).max() < 0.003  # the gyro's bias walked by 0.005
     assert resting.error @ np.linalg.solve(resting.estimator.estimate.P, resting.error) < 37.7  # chi2, 15, 99.9 %

@@ -156,7 +156,7 @@ def test_parts_of_a_sample_gather_the_noise_of_the_whole(cut):
         buffer.add(ImuSample(10_000_000 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
     def gathered(begin, end):
-        Q = preintegrate(buffer.run(begin, end), np.zeros(3), np.zeros(3)).Q
+        Q = preintegrate(buffer.run(begin, end, sensor_noise=True), np.zeros(3), np.zeros(3)).Q
         return np.diag(Q)[[0, 6]]
 
     density2 = np.array([config.imu.gyro_noise_density, config.imu.accel_noise_density]) ** 2

@@ -173,11 +173,11 @@ def _descend(s: _Unknowns, linearise: Callable[[_Unknowns], _Linear | None], sig
         step = np.linalg.solve(N, here.b)
         onward = _moved(s, step, sigma, here.points, used)
         there = linearise(onward)
-        if there is None or there.cost > here.cost * (1.0 + 1e-9):
+        if there is None or there.cost > here.cost + _CONVERGED:
             damping *= 10.0
             continue
         gained, s, here, damping = here.cost - there.cost, onward, there, 0.1 * damping
-        if gained < _CONVERGED:
+        if gained < _CONVERGED:  # also where rounding makes it a little worse
             return s, here
     return None
 
