@@ -86,7 +86,7 @@ def euroc_of_parts(images: Path, imu: Path, truth: Path) -> Figures:
         truth: file of the true motion.
     """
     names = [line.partition(",")[0] for line in (images / "cam0" / "data.csv").read_text().splitlines() if line[:1].isdigit()]
-    rows = [line.partition(",") for line in (imu / "data.csv").read_text().splitlines() if line[:1].isdigit()]
+    rows = [line.partition(",") for line in (imu / "data.csv").read_text().splitlines() if line[:1].isdigit() and ",," not in line]
     first = int(names[0])
     with tempfile.TemporaryDirectory() as name:
         parts = Path(name) / "mav0"
