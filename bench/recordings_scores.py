@@ -78,20 +78,23 @@ def euroc(recording: Path, truth: Path) -> Figures:
 
 
 def euroc_of_parts(images: Path, imu: Path, truth: Path) -> Figures:
-    """Score images, IMU and truth of one EuRoC sequence that are in three places.
+    """Score a part of an EuRoC sequence whose images, IMU and truth are in three places.
 
     Args:
-        images: folder with `cam0`.
+        images: folder with `cam0`, of which `data` has the images.
         imu: folder with `data.csv`; its stamps may be rounded: they are put back on the grid of the images' stamps.
         truth: file of the true motion.
     """
-    names = [line.partition(",")[0] for line in (images / "cam0" / "data.csv").read_text().splitlines() if line[:1].isdigit()]
+    names = sorted(file.stem for file in (images / "cam0" / "data").glob("*.png"))
     rows = [line.partition(",") for line in (imu / "data.csv").read_text().splitlines() if line[:1].isdigit() and ",," not in line]
     first = int(names[0])
     with tempfile.TemporaryDirectory() as name:
         parts = Path(name) / "mav0"
         (parts / "imu0").mkdir(parents=True)
-        (parts / "cam0").symlink_to((images / "cam0").resolve())
+        (parts / "cam0").mkdir()
+        for kept in ("data", "sensor.yaml"):
+            (parts / "cam0" / kept).symlink_to((images / "cam0" / kept).resolve())
+        (parts / "cam0" / "data.csv").write_text("".join(f"{name},{name}.png\n" for name in names))
         (parts / "imu0" / "sensor.yaml").symlink_to((imu / "sensor.yaml").resolve())
         (parts / "imu0" / "data.csv").write_text("".join(
             f"{first + round((float(stamp) - first) / EUROC_PERIOD) * EUROC_PERIOD},{values}\n" for stamp, _, values in rows))
