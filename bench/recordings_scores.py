@@ -104,7 +104,7 @@ def euroc_of_parts(images: Path, imu: Path, truth: Path) -> Figures:
 def dm_vio(folder: Path) -> Figures:
     """Score a recording in DM-VIO's format, with its own calibration, as its README and `sensors.py check` tell: clock and pixel noise."""
     camera, imu = np.loadtxt(folder / "cam0" / "camera.txt", max_rows=1), np.loadtxt(folder / "imu.txt")
-    T_CI = np.array(yaml.safe_load((folder / "camchain.yaml").read_text())["cam0"]["T_cam_imu"])
+    T_CI = np.array(yaml.safe_load((folder / "camchain.yaml").read_text().expandtabs())["cam0"]["T_cam_imu"])
     width, height = np.loadtxt(folder / "cam0" / "camera.txt", skiprows=1, max_rows=1, dtype=int).tolist()
     sensors = {"name": "l515", "cameras": {"cam0": {
         "model": "pinhole", "width": width, "height": height, "focal": camera[:2].tolist(), "centre": camera[2:4].tolist(),
