@@ -95,8 +95,7 @@ FLIGHT = """
 V1_01 in flight: 4 s with little acceleration hardly determine the scale. The IMU alone, fitted to the true path with free velocity, tilt
 and bias, makes this path 9 % longer than it is (5 mm rms of misfit)."""
 V101 = """
-At rest a tilt cannot be distinguished from the accelerometer's bias. NEES is that of `sensor.yaml`'s densities, while the idling rotors shake
-the IMU: `perceive.py` warns of it."""
+At rest a tilt cannot be distinguished from the accelerometer's bias."""
 RACING = """
 **Racing motion, rendered.** UZH-FPV's truth, our camera with errors of calibration as in all our flights, our IMU. Until the take-off the
 drone stands still, where the truth jitters by millimetres; the floor is 1 m below that place.
