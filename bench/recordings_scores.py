@@ -85,25 +85,30 @@ def euroc_of_parts(images: Path, imu: Path, truth: Path) -> Figures:
         imu: folder with `data.csv`; its stamps may be rounded: they are put back on the grid of the images' stamps.
         truth: file of the true motion.
     """
-    names = sorted(file.stem for file in (images / "cam0" / "data").glob("*.png"))
+    names = sorted(file.name for file in (images / "cam0" / "data").glob("*.png"))
     rows = [line.partition(",") for line in (imu / "data.csv").read_text().splitlines() if line[:1].isdigit() and ",," not in line]
-    first = int(names[0])
+    first = int(Path(names[0]).stem)
     with tempfile.TemporaryDirectory() as name:
-        parts = Path(name) / "mav0"
-        (parts / "imu0").mkdir(parents=True)
-        (parts / "cam0").mkdir()
-        for kept in ("data", "sensor.yaml"):
-            (parts / "cam0" / kept).symlink_to((images / "cam0" / kept).resolve())
-        (parts / "cam0" / "data.csv").write_text("".join(f"{name},{name}.png\n" for name in names))
-        (parts / "imu0" / "sensor.yaml").symlink_to((imu / "sensor.yaml").resolve())
-        (parts / "imu0" / "data.csv").write_text("".join(
-            f"{first + round((float(stamp) - first) / EUROC_PERIOD) * EUROC_PERIOD},{values}\n" for stamp, _, values in rows))
+        parts = _asl_folder(Path(name), images / "cam0" / "data", names, [
+            f"{first + round((float(stamp) - first) / EUROC_PERIOD) * EUROC_PERIOD},{values}" for stamp, _, values in rows])
+        for sensor, folder in (("cam0", images / "cam0"), ("imu0", imu)):
+            (parts / sensor / "sensor.yaml").symlink_to((folder / "sensor.yaml").resolve())
         return euroc(Path(name), truth)
 
 
+def _asl_folder(root: Path, images: Path, names: Sequence[str], samples: Sequence[str]) -> Path:
+    """Make a recording in the ASL format of a folder of images, named by their stamps, and rows `stamp,w,f`; return its `mav0`."""
+    parts = root / "mav0"
+    for sensor, rows in (("cam0", [f"{Path(name).stem},{name}" for name in names]), ("imu0", samples)):
+        (parts / sensor).mkdir(parents=True)
+        (parts / sensor / "data.csv").write_text("".join(f"{row}\n" for row in rows))
+    (parts / "cam0" / "data").symlink_to(images.resolve())
+    return parts
+
+
 def dm_vio(folder: Path) -> Figures:
-    """Score a recording in DM-VIO's format, with its own calibration, as its README and `sensors.py check` tell: clock and pixel noise."""
-    camera, imu = np.loadtxt(folder / "cam0" / "camera.txt", max_rows=1), np.loadtxt(folder / "imu.txt")
+    """Score a recording in DM-VIO's format: its own lens and mounting, the clock that `sensors.py check` finds, noise of a cheap IMU."""
+    camera = np.loadtxt(folder / "cam0" / "camera.txt", max_rows=1)
     T_CI = np.array(yaml.safe_load((folder / "camchain.yaml").read_text().expandtabs())["cam0"]["T_cam_imu"])
     width, height = np.loadtxt(folder / "cam0" / "camera.txt", skiprows=1, max_rows=1, dtype=int).tolist()
     sensors = {"name": "l515", "cameras": {"cam0": {
@@ -111,16 +116,10 @@ def dm_vio(folder: Path) -> Figures:
         "position": (-T_CI[:3, :3].T @ T_CI[:3, 3]).tolist(), "orientation": so3.quat_from_matrix(so3.nearest(T_CI[:3, :3].T)).tolist(),
         "rate": 17.0, "stamp_offset": 0.04}},
         "imu": {"rate": 200.0, "accel_noise_density": 1e-2, "gyro_noise_density": 1e-3, "accel_bias_walk": 1e-3, "gyro_bias_walk": 2e-5}}
-    stamps = [line.split()[0] for line in (folder / "imu.txt").read_text().splitlines() if line[:1].isdigit()]
+    samples = [",".join(line.split()[:7]) for line in (folder / "imu.txt").read_text().splitlines() if line[:1].isdigit()]
+    images = folder / "cam0" / "images"
     with tempfile.TemporaryDirectory() as name:
-        parts = Path(name) / "mav0"
-        (parts / "imu0").mkdir(parents=True)
-        (parts / "cam0").mkdir()
-        (parts / "cam0" / "data").symlink_to((folder / "cam0" / "images").resolve())
-        (parts / "cam0" / "data.csv").write_text("".join(
-            f"{file.stem},{file.name}\n" for file in sorted((folder / "cam0" / "images").iterdir())))
-        (parts / "imu0" / "data.csv").write_text("".join(
-            f"{stamp},{','.join(map(repr, row))}\n" for stamp, row in zip(stamps, imu[:, 1:7].tolist())))
+        _asl_folder(Path(name), images, sorted(file.name for file in images.iterdir()), samples)
         (Path(name) / "sensors.yaml").write_text(yaml.safe_dump(sensors))
         return run_perceive(Path(name), "--sensors", str(Path(name) / "sensors.yaml"), "--without", "target_localizer", "powerline_mapper",
                             "-p", "vio.filter.pixel_noise:=1.0")[0]
