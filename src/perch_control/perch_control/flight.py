@@ -21,6 +21,7 @@ from perch_control.maneuvers import (
 from perch_control.modes import Command, CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
+from perch_control.recovery import Recovery
 from perch_control.rotor_health import RotorHealth
 from perch_control.schedule import Schedule
 from perch_control.sensor_inputs import SensorInputs
@@ -334,7 +335,7 @@ class FlightController:
         """Return the compensation of disturbances; forces of the ground or of a wall must not be estimated as disturbances."""
         if self.compensator is None:
             return NO_COMPENSATION
-        if x.at_ground:
+        if x.at_ground or isinstance(x.source, Recovery):  # what a recovery follows, an impact or a blow, is in the estimate
             self.compensator.reset()
             return NO_COMPENSATION
         if x.mode in (State.LANDING, State.RECOVERING) or contact <= 0.0 or x.may_touch(0.0):
