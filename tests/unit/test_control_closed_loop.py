@@ -10,11 +10,13 @@ import pytest
 from closed_loop.loop import fly_to_contact, make_loop, perch, predictive
 from closed_loop.plant import EstimationError
 from perch_control.admission import AtEnd, TrajectoryRefused
+from perch_control.l1 import L1Augmentation
 from perch_control.modes import Command, State
 from perch_control.parameters import ControllerParameters
 from perch_core.config import from_mapping
 from perch_core.errors import ConfigError
 from perch_core.trajectory import rest_to_rest
+from perch_core.vehicle import load_vehicle
 
 PERCHES = ("surface_90_1.7m", "surface_90_3m", "surface_60_1.7m")
 
@@ -85,6 +87,20 @@ def test_missed_perch_recovers_to_a_hover(seed):
     assert loop.controller.state is State.HOVERING and np.linalg.norm(loop.plant.v) < 0.15
     assert min(lowest) > 0.15, "the pad is 1.2 m above the ground: the fall must end before it"
     assert min(edge) > 0.0, "turning upright, the rim must not strike the wall"
+
+
+@pytest.mark.parametrize("nearer", [0.0, 0.04])
+def test_l1_does_not_take_the_impact_for_a_disturbance_in_the_recovery(nearer):
+    plan = perch("surface_60_1.7m")
+    loop = make_loop()
+    loop.controller.compensator = L1Augmentation(load_vehicle("snapdragon"))
+    loop.begin_in_hover()
+    surface = plan.contact + nearer * plan.normal
+    loop.plant.wall, loop.plant.floor = (surface, plan.normal), -10.0
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    assert loop.run(plan.trajectory.duration + 0.5, until=lambda x: x.controller.state is State.RECOVERING)
+    assert loop.run(1.5, until=lambda x: x.controller.state is State.HOVERING), loop.events
+    assert (loop.plant.p - surface) @ plan.normal > 0.24
 
 
 def test_abort_in_mid_perch_recovers(seed=1):
