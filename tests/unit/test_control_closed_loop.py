@@ -16,7 +16,6 @@ from perch_control.parameters import ControllerParameters
 from perch_core.config import from_mapping
 from perch_core.errors import ConfigError
 from perch_core.trajectory import rest_to_rest
-from perch_core.vehicle import load_vehicle
 
 PERCHES = ("surface_90_1.7m", "surface_90_3m", "surface_60_1.7m")
 
@@ -65,14 +64,19 @@ def test_an_overhang_that_the_rotors_lag_spoils_is_refused_by_the_geometric_law_
     assert arrival.holds, arrival
 
 
+def miss(loop, plan, surface):
+    """Fly a plan from a hover to a surface at which nothing holds, high above the floor, until the controller recovers."""
+    loop.begin_in_hover()
+    loop.plant.wall, loop.plant.floor = (surface, plan.normal), -10.0
+    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
+    assert loop.run(plan.trajectory.duration + 0.5, until=lambda x: x.controller.state is State.RECOVERING)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_missed_perch_recovers_to_a_hover(seed):
     plan = perch("surface_90_1.7m")
     loop = make_loop(noise_seed=seed)
-    loop.begin_in_hover()
-    loop.plant.wall, loop.plant.floor = (plan.contact, plan.normal), -10.0
-    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
-    assert loop.run(plan.trajectory.duration + 0.5, until=lambda x: x.controller.state is State.RECOVERING)
+    miss(loop, plan, plan.contact)
     lowest = [loop.plant.p[2]]
     edge = []
 
@@ -93,12 +97,9 @@ def test_missed_perch_recovers_to_a_hover(seed):
 def test_l1_does_not_take_the_impact_for_a_disturbance_in_the_recovery(nearer):
     plan = perch("surface_60_1.7m")
     loop = make_loop()
-    loop.controller.compensator = L1Augmentation(load_vehicle("snapdragon"))
-    loop.begin_in_hover()
+    loop.controller.compensator = L1Augmentation(loop.controller.vehicle)
     surface = plan.contact + nearer * plan.normal
-    loop.plant.wall, loop.plant.floor = (surface, plan.normal), -10.0
-    loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
-    assert loop.run(plan.trajectory.duration + 0.5, until=lambda x: x.controller.state is State.RECOVERING)
+    miss(loop, plan, surface)
     assert loop.run(1.5, until=lambda x: x.controller.state is State.HOVERING), loop.events
     assert (loop.plant.p - surface) @ plan.normal > 0.24
 

@@ -79,7 +79,7 @@ class L1Augmentation:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the disturbance and the predictor: the vehicle may be on the ground, or its model has changed."""
+        """Reset the disturbance and the predictor: the vehicle may be on the ground, it recovers, or its model has changed."""
         self.disturbance = _ZERO
         self._last: tuple | None = None
 
