@@ -262,8 +262,9 @@ def main() -> int:
     single_threaded_blas()
     data = arguments.out / "results.json"
     before = json.loads(data.read_text()) if arguments.only and data.is_file() else {}
-    results: dict[str, Figures] = before["recordings"] if before.get("digest") == digest() else {}
     made_by = "python3 bench/recordings.py FOLDER"
+    head = {**code_version(), "command": made_by, "machine": machine()}
+    results: dict[str, Figures] = before["recordings"] if before.get("digest") == head["digest"] else {}
     for key, recording in RECORDINGS.items():
         if arguments.only not in (None, key):
             continue
@@ -276,7 +277,7 @@ def main() -> int:
             places = [arguments.folder / path for path in recording.paths] or [root() / "tests" / "recordings", arguments.out]
             results[key] = finite(recording.score(*places))
             print(f"{key}: {json.dumps(results[key])}", flush=True)
-        write_json(data, {**code_version(), "command": made_by, "machine": machine(), "recordings": results})
+        write_json(data, {**head, "recordings": results})
     (arguments.out / "README.md").write_text("\n".join(page(results, made_by)) + "\n")
     return 0
 
