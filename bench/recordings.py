@@ -151,7 +151,7 @@ def motion(f: Figures) -> list[str]:
 def l515(f: Figures) -> str:
     """Return the result on the recording without truth as text."""
     frames = sum(f["frames"].values())
-    return (f"L515, with `-p vio.filter.pixel_noise:=1.0`: {f['frames'].get('TRACKING', 0)} of {frames} frames tracked, {f['restarts']} restarts, "
+    return (f"L515, with `sigma: {{track: 1.0}}` in the sensor file: {f['frames'].get('TRACKING', 0)} of {frames} frames tracked, {f['restarts']} restarts, "
             f"{f['vio']['path_m']:.0f} m, the end {f['vio']['final_distance_m']:.2f} m from the start.")
 
 

@@ -114,15 +114,14 @@ def dm_vio(folder: Path) -> Figures:
     sensors = {"name": "l515", "cameras": {"cam0": {
         "model": "pinhole", "width": width, "height": height, "focal": camera[:2].tolist(), "centre": camera[2:4].tolist(),
         "position": (-T_CI[:3, :3].T @ T_CI[:3, 3]).tolist(), "orientation": so3.quat_from_matrix(so3.nearest(T_CI[:3, :3].T)).tolist(),
-        "rate": 17.0, "stamp_offset": 0.04}},
+        "rate": 17.0, "stamp_offset": 0.04, "sigma": {"track": 1.0}}},
         "imu": {"rate": 200.0, "accel_noise_density": 1e-2, "gyro_noise_density": 1e-3, "accel_bias_walk": 1e-3, "gyro_bias_walk": 2e-5}}
     samples = [",".join(line.split()[:7]) for line in (folder / "imu.txt").read_text().splitlines() if line[:1].isdigit()]
     images = folder / "cam0" / "images"
     with tempfile.TemporaryDirectory() as name:
         _asl_folder(Path(name), images, sorted(file.name for file in images.iterdir()), samples)
         (Path(name) / "sensors.yaml").write_text(yaml.safe_dump(sensors))
-        return run_perceive(Path(name), "--sensors", str(Path(name) / "sensors.yaml"), "--without", "target_localizer", "powerline_mapper",
-                            "-p", "vio.filter.pixel_noise:=1.0")[0]
+        return run_perceive(Path(name), "--sensors", str(Path(name) / "sensors.yaml"), "--without", "target_localizer", "powerline_mapper")[0]
 
 
 def photographed_floor(tests: Path, out: Path) -> Figures:

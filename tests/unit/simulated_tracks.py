@@ -161,9 +161,10 @@ class Setting:
     @property
     def believed(self) -> VioConfig:
         """The filter's settings."""
-        prior = self.vio.calibration if self.calibration else replace(
-            self.vio.calibration, rotation=0.0, translation=0.0, time_offset=0.0, focal=0.0, centre=0.0)
-        return replace(self.vio, calibration=prior, filter=replace(self.vio.filter, pixel_noise=self.pixel, slide_turn=0.0, slide_zoom=0.0))
+        prior = replace(self.vio.calibration, track=self.pixel)
+        prior = prior if self.calibration else replace(
+            prior, rotation=0.0, translation=0.0, time_offset=0.0, focal=0.0, centre=0.0)
+        return replace(self.vio, calibration=prior, filter=replace(self.vio.filter, slide_turn=0.0, slide_zoom=0.0))
 
 
 @dataclass(frozen=True)

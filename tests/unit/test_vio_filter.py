@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from perch_core import so3
+from perch_core.sensors import CalibrationSigmas
 from perch_core.vehicle import load_vehicle
 from perch_eval.perch_motion import Motion, PerchMotion, read_imu
 from unit import simulated_tracks
@@ -68,7 +69,7 @@ class Run:
 
     seed: int
     config: VioConfig = dataclasses.field(default_factory=lambda: dataclasses.replace(
-        VioConfig(), filter=dataclasses.replace(VioConfig().filter, pixel_noise=0.6, slide_turn=0.0, slide_zoom=0.0)))
+        VioConfig(), calibration=CalibrationSigmas(track=0.6), filter=dataclasses.replace(VioConfig().filter, slide_turn=0.0, slide_zoom=0.0)))
     start: float = 2.2
     turn_deg: float = 0.5
     offset: float = 0.010  # true; the file says 0.008
@@ -130,7 +131,7 @@ def under_way():
 def test_noisier_observations_are_as_if_declared_so():
     """Tracks with twice the declared noise give the state and the covariance of a filter that is told twice the noise."""
     declared = Run(2).config
-    config = dataclasses.replace(declared, filter=dataclasses.replace(declared.filter, pixel_noise=2.0 * declared.filter.pixel_noise))
+    config = dataclasses.replace(declared, calibration=CalibrationSigmas(track=2.0 * declared.calibration.track))
     runs = Run(2, noise=2.0), Run(2, config)
     used = [[report.used for report in run.frames(14)] for run in runs]
     a, b = (run.filter.state for run in runs)

@@ -27,7 +27,7 @@ def standing(rng, height=STANDING):
     pixels, valid = MOUNT.camera.project(X_C)
     valid &= MOUNT.camera.contains(pixels, 8)
     filter = Msckf(CONFIG, state, MOUNT.camera.fx)
-    noise = rng.normal(0, CONFIG.filter.pixel_noise, pixels.shape)
+    noise = rng.normal(0, CONFIG.calibration.track, pixels.shape)
     wrong = rng.multivariate_normal(np.zeros(at.CORE_SIZE), state.P)
     wrong[at.LENS] = 0.0
     state.inject(wrong)

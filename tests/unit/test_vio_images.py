@@ -84,7 +84,7 @@ def test_vignetting_does_not_hold_the_tracks_back(monkeypatch):
 
 
 def test_a_blurred_patch_is_known_less_well_than_a_sharp_one(monkeypatch):
-    """Foerstner: sigma_n^2 over the least eigenvalue of sum g g^T, with g of the scene without its noise; `pixel_noise` is the least."""
+    """Foerstner: sigma_n^2 over the least eigenvalue of sum g g^T, with g of the scene without its noise; `track` is the least."""
     rng, camera = np.random.default_rng(5), VEHICLE.mounts["down"].camera
     noise, texture = rng.normal(0.0, 2.0, (camera.height, camera.width)), rng.normal(0.0, 1.0, (camera.height, camera.width))
     vio, median = VisualInertialOdometry(VioConfig(), VEHICLE.mounts["down"], np.zeros(3)), []

@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_perception.vio.config import FilterConfig
+from perch_core.sensors import CalibrationSigmas
+from perch_perception.vio.config import FilterConfig, VioConfig
 from perch_perception.vio.sliding import TrackWalk
 
 FOCAL = 275.0
-CONFIG = dataclasses.replace(FilterConfig(), pixel_noise=0.3, slide_turn=2.0, slide_zoom=3.0)
+CONFIG = dataclasses.replace(VioConfig(), calibration=CalibrationSigmas(track=0.3), filter=FilterConfig(slide_turn=2.0, slide_zoom=3.0))
 
 
 def view(m=9):
@@ -20,15 +21,15 @@ def view(m=9):
 
 def test_whitened_observations_of_walking_points_are_white():
     rng, (b, d) = np.random.default_rng(1), view()
-    q = (CONFIG.slide_turn / FOCAL) ** 2 * np.arccos(np.clip((b[1:] * b[:-1]).sum(axis=1), -1, 1))
-    q += (CONFIG.slide_zoom / FOCAL) ** 2 * np.log(d[1:] / d[:-1])
+    q = (CONFIG.filter.slide_turn / FOCAL) ** 2 * np.arccos(np.clip((b[1:] * b[:-1]).sum(axis=1), -1, 1))
+    q += (CONFIG.filter.slide_zoom / FOCAL) ** 2 * np.log(d[1:] / d[:-1])
     steps = rng.normal(size=(20000, len(q))) * np.sqrt(q)
     # the point is where it is seen last: earlier observations are off by what it has walked since
     walk = -np.concatenate([np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros((20000, 1))], axis=1)
     noise = np.linspace(1.0, 3.0, len(b))
-    seen = walk + rng.normal(size=walk.shape) * noise * CONFIG.pixel_noise / FOCAL
+    seen = walk + rng.normal(size=walk.shape) * noise * CONFIG.calibration.track / FOCAL
     sliding = TrackWalk(CONFIG, FOCAL)
-    white = sliding.whitened(sliding.steps(b[:-1], b[1:], d[:-1], d[1:]), seen.T, noise) / (CONFIG.pixel_noise / FOCAL)
+    white = sliding.whitened(sliding.steps(b[:-1], b[1:], d[:-1], d[1:]), seen.T, noise) / (CONFIG.calibration.track / FOCAL)
     assert np.cov(white) == pytest.approx(np.eye(len(b)), abs=0.06)
 
 

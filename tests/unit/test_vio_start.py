@@ -21,7 +21,7 @@ SHIPPED = VioConfig()
 # tracks as noisy as the generator's, and an IMU as it is shaken in flight (config/sensors/euroc.yaml)
 CONFIG = dataclasses.replace(
     SHIPPED, imu=dataclasses.replace(SHIPPED.imu, accel_noise_density=1.6e-2, gyro_noise_density=1e-3, accel_bias_init=0.2),
-    filter=dataclasses.replace(SHIPPED.filter, pixel_noise=NOISE, slide_turn=0.0, slide_zoom=0.0))
+    calibration=dataclasses.replace(SHIPPED.calibration, track=NOISE), filter=dataclasses.replace(SHIPPED.filter, slide_turn=0.0, slide_zoom=0.0))
 
 
 def begin(name, seed, give_up=3.5):

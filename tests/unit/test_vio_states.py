@@ -54,7 +54,7 @@ class Flown:
         self.gyro_bias = R_BI @ gyro_bias
         self.samples = [axes.in_body(ImuSample(round(t * 1e9), w, f, "turned")) for t, w, f in zip(times, gyro, accel)]
         config = VioConfig()
-        config = replace(config, imu=replace(config.imu, accel_bias_init=0.6), filter=replace(config.filter, pixel_noise=0.2))
+        config = replace(config, imu=replace(config.imu, accel_bias_init=0.6), calibration=replace(config.calibration, track=0.2))
         start = self.motion.sample(np.array([begin])).p_WB[0]
         self.vio = VisualInertialOdometry(config, MOUNT, start)
         self.vio.tracker = GivenTracks(self.see)

@@ -22,13 +22,17 @@ from perch_core.errors import ConfigError
 
 @dataclass(frozen=True)
 class CalibrationSigmas:
-    """Uncertainty of a camera's calibration, 1 sigma; 0: known exactly. The defaults suit a careful Kalibr calibration."""
+    """Uncertainty of a camera's calibration (0: known exactly) and of points tracked in its images, 1 sigma.
+
+    The defaults suit a careful Kalibr calibration and a global shutter.
+    """
 
     rotation: float = quantity(0.005, unit="rad", low=0.0, high=0.2, doc="camera against IMU, per axis")
     translation: float = quantity(0.002, unit="m", low=0.0, high=0.2, doc="camera against IMU, per axis")
     time_offset: float = quantity(0.002, unit="s", low=0.0, high=0.1, doc="camera against the IMU's clock")
     focal: float = quantity(0.003, unit="-", low=0.0, high=0.05, doc="relative error of each focal length")
     centre: float = quantity(0.5, unit="px", low=0.0, high=50.0, doc="principal point, per axis")
+    track: float = quantity(0.085, unit="px", above=0.0, high=10.0, doc="white noise of a tracked point; about 1 with a rolling shutter")
 
     @property
     def lens(self) -> np.ndarray:

@@ -82,7 +82,7 @@ class ImuBuffer:
         self._intervals: deque[int] = deque(maxlen=_PERIODS)
         self._ends: list[int] = []
         self._rows: list[tuple[float, ...]] = []
-        self._sensor_noise: list[tuple[float, float]] = []  # of the rows: gyro variance, accel variance without vibration
+        self._sensor_noise: list[tuple[float, float]] = []  # of the rows: gyro variance, accel variance by the sensor file
         self.last: ImuSample | None = None
 
     @property

@@ -23,7 +23,7 @@ class Bearings:
     Attributes:
         b_C: unit vectors in C, shape (n, 3).
         shape: local lens model, d theta / d r and r / theta; r: radius in the normalised image at the angle theta, shape (n, 2).
-        noise: ratio of each bearing's 1 sigma to the configured `pixel_noise`, shape (n,); None: 1.
+        noise: ratio of each bearing's 1 sigma to the camera's `track`, shape (n,); None: 1.
     """
 
     b_C: np.ndarray

@@ -57,8 +57,8 @@ class Msckf:
     def __init__(self, config: VioConfig, state: State, focal_length: float) -> None:
         self.config, self.state = config, state
         self.tracks = Tracks()
-        self.sigma = config.filter.pixel_noise / focal_length
-        self.track_walk = TrackWalk(config.filter, focal_length)
+        self.sigma = config.calibration.track / focal_length
+        self.track_walk = TrackWalk(config, focal_length)
         self._gate = ekf.Gate(_GATE)
         self._used: set[int] = set()  # features whose information is in the state already
 

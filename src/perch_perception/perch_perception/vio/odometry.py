@@ -331,9 +331,9 @@ class VisualInertialOdometry:
         ground.add_ground_landmarks(self._running, view.ids[known], self._observe(view).chosen(known), floor)
 
     def _observe(self, features: Features) -> Bearings:
-        """Return bearings; 1 sigma of each is the larger of the configured `pixel_noise` and the patch fit's by image noise."""
+        """Return bearings; 1 sigma of each is the larger of the camera's `track` and the patch fit's by image noise."""
         return replace(observe(self.mount.camera, features.pixels),
-                       noise=np.maximum(features.sigma / self.config.filter.pixel_noise, 1.0))
+                       noise=np.maximum(features.sigma / self.config.calibration.track, 1.0))
 
     def _check_divergence(self, exposure: int, features: Features, report: FrameReport) -> VioResult:
         """Return the frame's result, after a check for divergence and for missing visual updates."""

@@ -15,15 +15,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import lapack
 
-from perch_perception.vio.config import FilterConfig
+from perch_perception.vio.config import VioConfig
 
 
 class TrackWalk:
     """Random walk of tracked points, for a focal length in pixels."""
 
-    def __init__(self, config: FilterConfig, focal_length: float) -> None:
-        self._sigma = config.pixel_noise / focal_length
-        self._turn, self._zoom = (config.slide_turn / focal_length) ** 2, (config.slide_zoom / focal_length) ** 2
+    def __init__(self, config: VioConfig, focal_length: float) -> None:
+        self._sigma = config.calibration.track / focal_length
+        self._turn, self._zoom = (config.filter.slide_turn / focal_length) ** 2, (config.filter.slide_zoom / focal_length) ** 2
 
     def steps(self, b_before: np.ndarray, b_now: np.ndarray, d_before: np.ndarray, d_now: np.ndarray) -> np.ndarray:
         """Return the variance q of one frame's walk [rad^2].
@@ -56,7 +56,7 @@ class TrackWalk:
         Args:
             steps: variance of the walk between neighbouring observations, see `steps` [rad^2], shape (m - 1,).
             rows: one row for each observation, shape (m, k).
-            noise: white noise of each observation, ratio of its 1 sigma to `pixel_noise`, shape (m,).
+            noise: white noise of each observation, ratio of its 1 sigma to the camera's, shape (m,).
         """
         to_end = np.zeros(len(rows))
         to_end[-2::-1] = np.cumsum(steps[::-1] / self._sigma**2)

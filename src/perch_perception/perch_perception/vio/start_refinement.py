@@ -140,8 +140,8 @@ def refine(config: VioConfig, mount: CameraMount, steps: Sequence[np.ndarray], s
     z = np.zeros(_NOISE + 9 * len(steps))
     s = _Unknowns(R_WB, v_WB, np.concatenate([gyro_bias, accel_bias]), mount.R_BC, mount.p_BC, z, np.array([x.X_W for x in sights]))
     z[_BIASES] = (s.biases - np.concatenate([known_bias, np.zeros(3)])) / sigma[:6]
-    track_walk = TrackWalk(config.filter, mount.camera.fx)
-    variance = (config.filter.pixel_noise / mount.camera.fx) ** 2
+    track_walk = TrackWalk(config, mount.camera.fx)
+    variance = (config.calibration.track / mount.camera.fx) ** 2
     used = np.ones(len(sights), bool)
     while True:
         linearised = partial(_linearised, steps=steps, sights=sights, used=used, track_walk=track_walk, variance=variance, sigma=sigma)
