@@ -15,6 +15,7 @@ from oracles import rigid_body
 from perch_control.admission import AtEnd, Order
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.l1 import L1Augmentation
+from perch_control.modes import State
 from perch_control.monitors import reference_tilt_deg
 from perch_control.nmpc import LineWeights
 from perch_control.nmpc.controller import LINE_RAMP
@@ -32,6 +33,7 @@ from perch_core.vehicle import ControlGains, load_vehicle
 from perch_planner.powerline import problem
 from perch_sim.scenario import load_scenario
 from perch_sim.timing import CONTROL_PERIOD
+from unit.controller_flight import Flight, parameters
 
 SNAPDRAGON, RPG = load_vehicle("snapdragon"), load_vehicle("rpg")
 
@@ -250,6 +252,18 @@ def test_laws_switch_in_flight_without_a_jump():
         loop.run(0.2)
     loop.run(1.5)
     assert np.all(loop.rmse < 0.03)
+
+
+@pytest.mark.slow
+def test_a_body_rate_out_of_all_reason_leaves_the_commands_finite():
+    """With such a state the iterate diverges, and the QP ends in numbers that are not finite: the law that stands in commands."""
+    flight, rng = Flight(params=parameters(type="nmpc")).take_off(), np.random.default_rng(0)
+    for _ in range(10):
+        w = rng.normal(size=3)
+        flight.step(0.002, w_B=tuple(80.0 * w / np.linalg.norm(w)))
+        flight.step(0.5)
+    assert np.isfinite([command.rotor_speed for command in flight.motors]).all()
+    assert flight.component.flight.law.failures > 0 and flight.state is State.HOVERING
 
 
 @pytest.mark.parametrize("law", ["geometric", "nmpc"])

@@ -55,6 +55,23 @@ def test_an_abort_at_rest_is_the_end_of_what_was_to_follow(command, state):
     assert flight.state is state and flight.plant.p[2] < 0.01
 
 
+@pytest.mark.parametrize("command, end", [(Command.HOVER, State.HOVERING), (Command.LAND, State.DISARMED)])
+def test_a_command_that_is_repeated_brakes_like_one_that_is_given_once(command, end):
+    stops = []
+    for times in (1, 40):
+        loop = hovering_loop()
+        begin = loop.plant.p.copy()
+        loop.follow(rest_to_rest(begin, begin + [10.0, 0.0, 0.0], 0.0, 0.0, 5.0))
+        loop.run(2.5)
+        for _ in range(times):
+            loop.controller.command(command)
+            loop.run(0.1)
+        loop.run(8.0, until=lambda x: x.controller.state is State.DISARMED)
+        assert loop.controller.state is end
+        stops.append(loop.plant.p - begin)
+    np.testing.assert_allclose(stops[0], stops[1], atol=0.02)
+
+
 def test_what_waited_when_the_motors_were_stopped_is_not_flown_when_they_run_again():
     flight = Flight()
     flight.step(0.2)

@@ -14,6 +14,7 @@ from perch_control.maneuvers import following, recovered
 from perch_control.modes import Command, CommandRefused, State
 from perch_control.odometry_gate import OdometryGate
 from perch_control.reference import FlatReference, SampledReference
+from perch_core import so3
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory, rest_to_rest
 
 REST = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -134,6 +135,20 @@ def test_a_recovery_that_ends_at_the_ground_lands(height, end):
     loop.controller.flight_state = recovered(loop.controller.flight_state._replace(ground=0.0), "for a test")
     loop.run(4.0)
     assert loop.controller.state is end, loop.events
+
+
+@pytest.mark.parametrize("inclination", [0.0, 10.0, 20.0, 60.0])
+def test_a_recovery_leaves_a_surface_of_any_inclination(inclination):
+    turn = np.radians(inclination)
+    loop, normal = make_loop(), (-np.sin(turn), 0.0, np.cos(turn))
+    loop.begin_in_hover((0.0, 0.0, 3.0))
+    loop.plant.R, begin = so3.exp(np.array([0.0, -turn, 0.0])), loop.plant.p.copy()
+    loop.plant.wall = begin, np.array(normal)
+    loop.run(0.002)
+    loop.controller.flight_state = recovered(loop.controller.flight_state._replace(attached_to=normal), "for a test")
+    assert loop.run(2.0, until=lambda x: x.controller.state is State.HOVERING), loop.events
+    loop.run(1.0)
+    assert (loop.plant.p - begin) @ normal > 0.25
 
 
 def test_attached_stops_the_motors_and_arming_again_recovers():

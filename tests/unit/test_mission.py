@@ -301,6 +301,38 @@ def test_cancel_works_in_every_phase(phase):
         ControllerState.DISARMED if on_ground else ControllerState.ATTACHED if attached else ControllerState.HOVERING)
 
 
+def test_a_vehicle_that_comes_off_after_a_cancel_is_started_all_the_same():
+    world = World(stays=False)
+    world.run(cancel_in=Phase.PERCHED)
+    assert world.commands[-2:] == [Command.ARM, Command.HOVER]
+    assert world.outcome.result is Result.CANCELLED and world.controller is ControllerState.HOVERING
+
+
+def test_after_a_cancel_the_motors_of_an_attached_vehicle_stop_even_if_a_message_is_lost():
+    world = World()
+    world.lost_attached = 1
+    world.run(cancel_in=Phase.PERCHED)
+    assert world.outcome.result is Result.CANCELLED and world.controller is ControllerState.ATTACHED
+
+
+def test_an_armed_vehicle_takes_off_when_the_estimator_is_ready():
+    world = World(ready=False)
+    world.controller = ControllerState.ARMED
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    world.tick()
+    assert world.machine.phase is Phase.ARMING
+    world.ready = True
+    world.tick()
+    assert world.machine.phase is Phase.TAKE_OFF
+
+
+def test_the_time_limit_of_a_take_off_begins_after_a_long_way():
+    world = World()
+    world.run(Goal(takeoff_height=1.2, search_timeout=6.0, search_position=np.array([30.0, 0.0, 1.2])))
+    assert world.machine.settings.transit_speed * world.machine.settings.phase_timeout < 30.0
+    assert world.outcome.result is Result.PERCHED
+
+
 def test_a_cancel_at_the_take_off_holds_whether_or_not_it_has_begun():
     world = reached(Phase.ARMING)
     world.tick()

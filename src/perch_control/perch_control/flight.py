@@ -220,11 +220,11 @@ class FlightController:
         return self._schedule.leave_by_way_out(x, reason) or self._brake_to_hover(x, reason)
 
     def _brake_to_hover(self, x: FlightState, reason: str) -> FlightState:
-        """Discard pending trajectories and brake to a hover, or land where a hover would touch the ground."""
+        """Discard pending trajectories and brake to a hover, or land where a hover would touch the ground; a hover continues, with its brake."""
         self._schedule.clear()
         if x.low:
             return landing(x, f"landing: {reason}", self.settings.land_speed)
-        return stopped(x, reason)
+        return x._replace(message=reason) if x.mode is State.HOVERING else stopped(x, reason)
 
     def report_refusal(self, message: str) -> None:
         """Publish why an order was refused."""

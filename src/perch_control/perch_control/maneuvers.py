@@ -109,7 +109,9 @@ def recovered(x: FlightState, message: str) -> FlightState:
 
 
 def landing(x: FlightState, message: str, speed: float) -> FlightState:
-    """Descend with a speed [m/s] until ground contact."""
+    """Descend with a speed [m/s] until ground contact; a landing continues: repeated, its brake would never act."""
+    if x.mode is State.LANDING:
+        return x._replace(message=message)
     setpoint = x.setpoint()
     p, v, a = _initial_motion(x, setpoint)
     return following(entered(x, State.LANDING, message), brake(p, v, a, setpoint.h, (0.0, 0.0, -speed), x.stopping[0]))

@@ -75,7 +75,8 @@ class Recovery(ByState):
             f = scale(_THRUST_SHARE * self._thrust_max, self._push)
             self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=self._h)
             return
-        climb = min(max(-_CLIMB_GAIN * moved[2], -_CLIMB_SPEED), _CLIMB_SPEED)
+        rise = _AWAY_DISTANCE * self._normal[2] if self._normal is not None else 0.0
+        climb = min(max(_CLIMB_GAIN * (rise - moved[2]), -_CLIMB_SPEED), _CLIMB_SPEED)
         away: Vector = (0.0, 0.0, 0.0)
         if self._normal is not None and clearance < _AWAY_DISTANCE:
             nx, ny, _ = self._normal

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from perch_core.values import PerchGoal
 from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
-from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Result, Target
+from perch_control.mission.values import Command, ControllerState, Goal, Inputs, Outputs, Phase, Result, Target
 from perch_control.mission.waypoints import waypoint_lines
 from perch_control.mission.wire import LineMission
 
@@ -27,9 +27,14 @@ class InspectionMission(LineMission):
             return f"inspection: the parameter mission.waypoints holds {len(settings.places)} waypoints, needs at least 2"
         return super().problem(goal, settings)
 
+    def start(self, goal: Goal, time: float) -> None:
+        """Start a goal with the waypoints of now: later changes are for the next goal."""
+        super().start(goal, time)
+        self._places = self.settings.places
+
     def at_target(self, inputs: Inputs, outputs: Outputs, target: Target) -> None:
         """Fly from the hover along the waypoints; the controller's line terms keep the line in view and avoid all lines."""
-        places = [self._moves.hover, *self.settings.places]
+        places = [self._moves.hover, *self._places]
         outputs.reference = waypoint_lines(places, self.settings.inspection_speed, inputs.time + LEAD)
         outputs.trajectory_id = self._flown_id = self._new_id()
         self._inspected = inputs.time + LEAD + outputs.reference.duration
@@ -42,7 +47,7 @@ class InspectionMission(LineMission):
             if inputs.time < self._inspected:
                 self._fail_attempt(inputs, f"inspection given up: {inputs.controller_message}")
             else:
-                self._end(outputs, Result.PERCHED, f"inspected along {len(self.settings.places)} waypoints")
+                self._end(outputs, Result.PERCHED, f"inspected along {len(self._places)} waypoints")
         elif inputs.time > self._inspected + self.settings.arming_timeout:
             outputs.commands.append((Command.HOVER, "the inspection does not end"))
             self._fail_attempt(inputs, f"the inspection does not end: {inputs.controller_message}")

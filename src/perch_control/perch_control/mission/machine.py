@@ -143,7 +143,7 @@ class MissionMachine(ABC):
             self._end(outputs, Result.PERCHED_ALREADY, "the vehicle is perched; call the service `depart` first")
         elif inputs.controller in _FLYING and inputs.estimator_ready:
             self._go_to_search(inputs, outputs, "already flying: going to the search place")
-        elif inputs.controller is ControllerState.ARMED:
+        elif inputs.controller is ControllerState.ARMED and inputs.estimator_ready:
             self._go_to_search(inputs, outputs, "taking off", on_ground=True)
         elif self._elapsed(inputs) > self.settings.arming_timeout:
             outputs.commands.append((Command.DISARM, "arming took too long"))
@@ -246,9 +246,10 @@ class MissionMachine(ABC):
             return True
         if self._handle_descent(inputs, outputs):
             return True
-        if self.phase is Phase.TAKE_OFF and self._elapsed(inputs) > self.settings.phase_timeout:
+        limit = self._moves.length + self.settings.phase_timeout
+        if self.phase is Phase.TAKE_OFF and self._elapsed(inputs) > limit:
             outputs.commands.append((Command.LAND, "take-off took too long"))
-            self._end(outputs, Result.TIMEOUT, f"search hover not reached within {self.settings.phase_timeout:g} s; landing")
+            self._end(outputs, Result.TIMEOUT, f"search hover not reached within {limit:.0f} s; landing")
             return True
         return False
 
@@ -278,7 +279,7 @@ class MissionMachine(ABC):
     def _cancel(self, inputs: Inputs, outputs: Outputs) -> None:
         self._cancelled = True
         if self.phase is Phase.PERCHED:
-            self._end(outputs, Result.CANCELLED, "cancelled; attached with motors off")
+            self.message = "cancelled too late: perched"  # the goal ends when the surface is known to hold the vehicle
         elif inputs.controller in (ControllerState.DISARMED, ControllerState.ARMED):
             # By now it may have taken off: one of the two is refused.
             outputs.commands += [(Command.LAND, "cancelled"), (Command.DISARM, "cancelled")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -118,8 +119,8 @@ class NmpcController(Law):
         return self
 
     def begin(self) -> None:
-        """Take over in flight: the first iterate is the reference."""
-        self._warm = False
+        """Take over in flight: the first iterate is the reference, and line terms ramp up."""
+        self._warm, self._line_time = False, 0.0
 
     def set_vehicle(self, vehicle: Vehicle) -> None:
         """Use a vehicle model that differs from the initial one in its thrust; the compiled code takes rotor thrusts only."""
@@ -159,6 +160,8 @@ class NmpcController(Law):
         self._rows.fill(reference.source, reference.elapsed + ahead, self._spacing, self._R)
         try:
             speed, wrench, reached = self._iterate(state, rotors, compensation, ahead, ramps)
+            if not all(map(isfinite, speed)):
+                raise QpFailure("the iterate diverged")
         except QpFailure:
             self.failures += 1
             self._warm = False

@@ -38,6 +38,5 @@ class NmpcSettings:
     attitude: Vector3 = quantity((12.0, 12.0, 4.0), unit="1/rad^2", low=0.0, doc="axes of B")
     rate: Vector3 = quantity((0.08, 0.08, 0.1), unit="s^2/rad^2", low=0.0, doc="axes of B")
     thrust: float = quantity(1.0, unit="1/N^2", above=0.0, doc="distance of the rotor thrusts from the reference's")
-    ramps: bool = quantity(False, doc="thrusts change over an interval as the reference's, and are sent early by the lag of led rotors; "
-                                      "else they are held, and sent early by `gains.lead`")
+    ramps: bool = quantity(False, doc="thrusts change over an interval as the reference's; else they are held")
     lines: LineWeights = part(LineWeights)
