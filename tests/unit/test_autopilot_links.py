@@ -87,6 +87,35 @@ def test_the_supervisor_sends_without_commands_reopens_the_link_and_ends_with_th
         assert link.process.wait(120.0) == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("taken", [False, True])
+def test_a_supervisor_whose_link_is_lost_ends_when_the_autopilot_has_been_disarmed_or_belongs_to_another(taken):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(120.0)
+        address = f"tcp:127.0.0.1:{server.getsockname()[1]}"
+        link = SupervisedLink(address, 1450, 1420, 0.2, CURVES)
+        with server.accept()[0] as peer:
+            peer.settimeout(120.0)
+            link.command(True, STICKS)
+            assert peer.recv(4096)
+            port = server.getsockname()[1]
+            server.close()
+            link.close()
+    time.sleep(1.0)                                            # motors should be off, and the link cannot be opened
+    assert link.process.poll() is None
+    if taken:
+        with socket.socket(socket.AF_UNIX) as lock:
+            lock.bind(f"\0perch_autopilot {address}")
+            assert link.process.wait(120.0) == 0
+        return
+    with socket.create_server(("127.0.0.1", port)) as server:
+        server.settimeout(120.0)
+        with server.accept()[0] as peer:
+            peer.settimeout(120.0)
+            assert peer.recv(4096).startswith(msp.channels((1500, 1500, 1000, 1500, OFF, OFF)))
+            assert link.process.wait(120.0) == 0
+
+
 @pytest.fixture(params=["serial", "tcp"])
 def address(request) -> Iterator[str]:
     """A serial port, or one by TCP."""

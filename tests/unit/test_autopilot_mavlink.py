@@ -50,6 +50,16 @@ def test_a_pilot_who_takes_the_mode_back_keeps_it():
     assert Request.MODE in asked(machine, 2.0, start=8.0)
 
 
+@pytest.mark.parametrize("following", [True, False])
+def test_who_disarms_the_autopilot_is_obeyed_until_the_commands_have_the_motors_off(following):
+    machine = Offboard(autopilot=PX4, armed=True, following=True)
+    assert asked(machine, 1.0) == []
+    machine.armed, machine.following = False, following
+    assert asked(machine, 5.0, start=1.0) == []
+    asked(machine, 0.1, start=6.0, wanted=False)
+    assert asked(machine, 1.5, start=6.1)[0] is (Request.ARM if following else Request.MODE)
+
+
 def test_what_flies_already_is_asked_for_nothing():
     """A node that is started anew in flight: neither the pilot's mode, nor a vehicle that follows without set points, is its to change."""
     assert asked(Offboard(autopilot=PX4, armed=True), 5.0) == []
@@ -137,6 +147,7 @@ def test_odometry_leaves_as_ned_with_its_covariance(autopilot):
     autopilot.node.on_odometry(OdometryState(SECOND, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (4.0, 5.0, 6.0), (0.1, 0.2, 0.3), P, P))
     said = autopilot.heard()["ODOMETRY"]
     assert (said.x, said.y, said.z, said.vx, said.vy, said.vz) == (2.0, 1.0, -3.0, 4.0, -5.0, -6.0)
+    assert (said.frame_id, said.child_frame_id) == (20, 12)    # LOCAL_FRD, BODY_FRD: all that ArduPilot takes
     assert said.q == pytest.approx([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])  # forward is east: a heading of 90 deg, w x y z
     assert [said.pose_covariance[k] for k in (0, 6, 11, 15, 18, 20)] == [2.0, 1.0, 3.0, 5.0, 4.0, 6.0]
 
@@ -187,29 +198,31 @@ def test_imu_comes_in_by_the_hosts_clock_and_torn_frames_are_counted(autopilot):
 
 
 def test_ardupilot_gets_set_points_when_it_is_known_to_take_their_thrust():
-    """GUID_OPTIONS, bit 3; without it ArduPilot takes the thrust as a climb rate."""
+    """GUID_OPTIONS, bit 3, and ATC_ANGLE_BOOST 0; else the thrust is a climb rate, or depends on the tilt."""
     autopilot = Autopilot(ARDUPILOT)
     m = autopilot.mavlink
 
-    def second(options: float | None = None) -> dict:
-        """What the node says in a second, with commands, heartbeats and, where it is given, the parameter's value."""
+    def second(options: float | None = None, boost: float | None = None) -> dict:
+        """What the node says in a second, with commands, heartbeats and, where they are given, the parameters' values."""
         said: dict = {}
         autopilot.say(m.heartbeat_encode(2, ARDUPILOT, 0, 0, 4))
         if options is not None:
             autopilot.say(m.param_value_encode(b"GUID_OPTIONS", options, 6, 1, 0))
+        if boost is not None:
+            autopilot.say(m.param_value_encode(b"ATC_ANGLE_BOOST", boost, 2, 1, 0))
         for _ in range(200):
             autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
             said |= autopilot.heard()
         return said
 
     try:
-        for options in (None, 0.0, 4.0, float("nan")):
-            said = second(options)
-            assert said["PARAM_REQUEST_READ"].param_id == "GUID_OPTIONS" and said["PARAM_REQUEST_READ"].param_index == -1
+        for options, boost in ((None, None), (0.0, None), (4.0, 0.0), (float("nan"), float("nan")), (9.0, 1.0)):
+            said = second(options, boost)
+            assert said["PARAM_REQUEST_READ"].param_id == "ATC_ANGLE_BOOST" and said["PARAM_REQUEST_READ"].param_index == -1
             assert not {"SET_ATTITUDE_TARGET", "COMMAND_LONG"} & set(said)
         report = autopilot.got["diagnostics"][-1]
-        assert report.level == 2 and "GUID_OPTIONS does not have bit 3 (value 8)" in report.message
-        second(9.0)
+        assert report.level == 2 and "GUID_OPTIONS needs bit 3 (value 8" in report.message
+        second(9.0, 0.0)
         said = second()
         assert {"SET_ATTITUDE_TARGET", "COMMAND_LONG"} <= set(said) and "PARAM_REQUEST_READ" not in said
         assert autopilot.got["diagnostics"][-1].level == 0
@@ -232,6 +245,28 @@ def test_it_arms_by_its_own_way_and_says_why_not(autopilot):
     autopilot.heard()
     said = " | ".join(line.text for line in autopilot.got["log"])
     assert "refuses arming: TEMPORARILY_REJECTED" in said and "Preflight Fail: Accel #0 uncalibrated" in said
+
+
+def test_it_disarms_in_flight_what_it_has_flown(autopilot):
+    """Both autopilots refuse to disarm in flight unless it is forced."""
+    m = autopilot.mavlink
+
+    def disarmed(commanded: bool) -> list:
+        orders = []
+        for armed in (commanded, False):
+            for k in range(300):
+                if k % 50 == 0:
+                    autopilot.say(m.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
+                autopilot.node.on_rates_thrust(RatesThrust(0, armed, (0.0, 0.0, 0.0), 9.81 if armed else 0.0))
+                if (order := autopilot.heard().get("COMMAND_LONG")) is not None:
+                    orders.append((order.command, order.param1, order.param2))
+        return orders
+
+    assert set(disarmed(False)) == {(400, 0.0, 0.0)}           # somebody else has armed it
+    assert set(disarmed(True)) == {(400, 0.0, 21196.0)}
+    autopilot.say(m.command_ack_encode(400, 1))
+    autopilot.heard()
+    assert "refuses disarming: TEMPORARILY_REJECTED" in autopilot.got["log"][-1].text
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------
@@ -325,6 +360,7 @@ def test_a_link_that_is_opened_anew_gives_ardupilot_set_points_as_before(options
     m = autopilot.mavlink
     if options is not None:
         autopilot.say(m.param_value_encode(b"GUID_OPTIONS", options, 6, 1, 0))
+        autopilot.say(m.param_value_encode(b"ATC_ANGLE_BOOST", 0.0, 2, 1, 0))
     autopilot.heard()
     ours, theirs = socket.socketpair()
     monkeypatch.setattr("perch_autopilot.mavlink.Link", lambda _: Link(f"fd:{ours.detach()}"))

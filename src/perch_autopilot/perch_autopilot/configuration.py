@@ -47,7 +47,7 @@ def load_configuration(name: str) -> Configuration:
     """Return the configuration of `config/autopilot/<name>.txt`, or of a file.
 
     Raises:
-        ConfigError: no such file, no line in it, or a line that is none of `set`, `feature`, `aux`, `map`, `serial`, `mixer`.
+        ConfigError: no such file, no line in it, or a line that is none of `set`, `feature`, `aux`, `map`, `rxrange`, `serial`, `mixer`.
     """
     file = Path(name) if Path(name).suffix else config.config_dir() / "autopilot" / f"{name}.txt"
     try:
@@ -56,8 +56,8 @@ def load_configuration(name: str) -> Configuration:
         raise ConfigError("autopilot.configuration", str(name), f"cannot be read: {error}") from None
     lines = tuple(line for raw in text.splitlines() if (line := " ".join(raw.split("#")[0].split())))
     for line in lines:
-        if not (_SET.fullmatch(line) or line.split()[0] in ("feature", "aux", "map", "serial", "mixer")):
-            raise ConfigError(str(file), line, "is not one of set NAME = VALUE, feature, aux, map, serial, mixer")
+        if not (_SET.fullmatch(line) or line.split()[0] in ("feature", "aux", "map", "rxrange", "serial", "mixer")):
+            raise ConfigError(str(file), line, "is not one of set NAME = VALUE, feature, aux, map, rxrange, serial, mixer")
     if not lines:
         raise ConfigError(str(file), "", "has no line")
     return Configuration(str(file), lines)

@@ -22,6 +22,10 @@ class LinkError(PerchError):
     """Raised when the link cannot be opened, or has ended."""
 
 
+class PortTaken(LinkError):
+    """Raised when another process has the port."""
+
+
 class Link:
     """Stream of bytes to and from an autopilot."""
 
@@ -48,8 +52,11 @@ class Link:
         except (OSError, OverflowError) as error:
             raise LinkError(f"{address}: cannot be opened: {getattr(error, 'strerror', None) or error}") from None
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: bytes) -> bool:
         """Send a frame, whole or not at all: while the port is full it is dropped, because a late command would be worse.
+
+        Returns:
+            Whether the port has accepted the whole frame.
 
         Raises:
             LinkError: the link has ended.
@@ -59,10 +66,12 @@ class Link:
                 self._rest = self._rest[os.write(self.file, self._rest):]
             if not self._rest:
                 self._rest = data[os.write(self.file, data):]
+                return not self._rest
         except BlockingIOError:
             pass
         except OSError as error:
             raise LinkError(f"the link to the autopilot has ended: {error.strerror}") from None
+        return False
 
     def read(self, timeout: float = 0.0) -> bytes:
         """Return the bytes that arrive within a time [s]; empty if there are none.
@@ -101,7 +110,7 @@ def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socke
         lock.bind(f"\0perch_autopilot {address}")
     except OSError:
         lock.close()
-        raise LinkError(f"{address}: {_TAKEN}") from None
+        raise PortTaken(f"{address}: {_TAKEN}") from None
     try:
         connection = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
     except BaseException:
@@ -124,7 +133,7 @@ def _opened_port(address: str) -> int:
         _set_serial(file, baud or "115200", address)
     except BlockingIOError:
         os.close(file)
-        raise LinkError(f"{address}: {_TAKEN}") from None
+        raise PortTaken(f"{address}: {_TAKEN}") from None
     except BaseException:
         os.close(file)
         raise

@@ -2,7 +2,7 @@
 
 | to it | SET_ATTITUDE_TARGET (body rates, thrust), ODOMETRY with covariance, HEARTBEAT, TIMESYNC, COMMAND_LONG (mode, arm), PARAM_REQUEST_READ |
 | --- | --- |
-| from it | HEARTBEAT, HIGHRES_IMU, TIMESYNC, COMMAND_ACK, STATUSTEXT, PARAM_VALUE (GUID_OPTIONS of ArduPilot) |
+| from it | HEARTBEAT, HIGHRES_IMU, TIMESYNC, COMMAND_ACK, STATUSTEXT, PARAM_VALUE (GUID_OPTIONS and ATC_ANGLE_BOOST of ArduPilot) |
 
 If commands stop, set points stop, and the autopilot's own failsafe for their loss takes effect. The messages are those of
 `pymavlink`, an optional extra (`python3 scripts/setup.py --extra mavlink`).
@@ -23,7 +23,7 @@ from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, ImuSample, OdometryState, RatesThrust
 from perch_autopilot import frames
 from perch_autopilot.clock import MAX_STEP, clock_jump
-from perch_autopilot.offboard import ARDUPILOT, GUID_OPTIONS, HEARTBEAT_TIMEOUT, PX4, THRUST_AS_THRUST, Offboard, Request
+from perch_autopilot.offboard import ANGLE_BOOST, ARDUPILOT, GUID_OPTIONS, HEARTBEAT_TIMEOUT, PX4, THRUST_AS_THRUST, Offboard, Request
 from perch_autopilot.link import REOPEN, Link, LinkError
 from perch_autopilot.rates import commanded_vehicle
 
@@ -31,7 +31,9 @@ _HANDSHAKE = 3.0                     # for the autopilot's first heartbeat, whic
 _JUMP_SAMPLES = 3                          # samples in a row that do not follow the last one: its clock has clock_jump
 _STALE = 100_000_000                 # a command that is older is not sent any more [ns]
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
-_COMMANDS = {176: "the mode", 400: "arming"}
+_SET_MODE, _ARM_DISARM = 176, 400     # MAV_CMD_DO_SET_MODE, MAV_CMD_COMPONENT_ARM_DISARM
+_FORCED = 21196.0                    # of MAV_CMD_COMPONENT_ARM_DISARM: disarm also in flight
+_LOCAL_FRD, _BODY_FRD = 20, 12       # MAV_FRAME: axes as NED, whose x need not be north; ArduPilot takes no other odometry
 _ODOMETRY_PERIOD = NANOSECONDS // 50  # odometry is sent no more often: at 500 Hz it alone, 240 bytes each, would fill 921600 baud [ns]
 _IGNORE_ATTITUDE = 128               # of SET_ATTITUDE_TARGET's type_mask: rates and thrust count
 
@@ -141,7 +143,7 @@ class Mavlink(Component[MavlinkParameters]):
         twist = (*frames.body(state.v_B), *frames.body(state.w_B)) if measured else (nan,) * 6
         i, j, k, w = frames.attitude(np.array(state.q_WB))
         self._send(mavlink.odometry_encode(
-            max(state.stamp, 0) // 1000, 1, 12, x, y, z, (w, i, j, k), *twist,  # LOCAL_NED, BODY_FRD
+            max(state.stamp, 0) // 1000, _LOCAL_FRD, _BODY_FRD, x, y, z, (w, i, j, k), *twist,
             _upper(state.pose_covariance, frames.WORLD), _upper(state.twist_covariance, frames.BODY)))
 
     def _send(self, message: Any) -> None:
@@ -177,15 +179,18 @@ class Mavlink(Component[MavlinkParameters]):
             self._send_set_point(command)
         request = self.offboard.next_request(now * 1e-9, command is not None and command.armed, command is not None)
         if request is Request.MODE:
-            self._send_command(176, 1.0, *_mode_words(self.offboard.mode))             # MAV_CMD_DO_SET_MODE
-        elif request is not Request.NOTHING:
-            self._send_command(400, 1.0 if request is Request.ARM else 0.0)            # MAV_CMD_COMPONENT_ARM_DISARM
+            self._send_command(_SET_MODE, 1.0, *_mode_words(self.offboard.mode))
+        elif request is Request.ARM:
+            self._send_command(_ARM_DISARM, 1.0)
+        elif request is Request.DISARM:
+            self._send_command(_ARM_DISARM, 0.0, _FORCED if self.offboard.forced else 0.0)
         if now - self._last_heartbeat >= NANOSECONDS:
             self._last_heartbeat = now
             self._send(self._mavlink.heartbeat_encode(18, 8, 0, 0, 4))                 # ONBOARD_CONTROLLER, INVALID, ACTIVE
             self._send(self._mavlink.timesync_encode(0, now))
             if not self.offboard.takes_thrust:
-                self._send(self._mavlink.param_request_read_encode(self.config.system, 1, GUID_OPTIONS.encode(), -1))
+                for name in (GUID_OPTIONS, ANGLE_BOOST):
+                    self._send(self._mavlink.param_request_read_encode(self.config.system, 1, name.encode(), -1))
             self._diagnose(now)
 
     def _received(self, now: int) -> bytes:
@@ -200,10 +205,12 @@ class Mavlink(Component[MavlinkParameters]):
             return b""
 
     def _on_link_lost(self, error: LinkError) -> None:
-        """Close a link that has ended, and reset all state but the autopilot's type and options."""
+        """Close a link that has ended, and reset all state but the autopilot's type and parameters, and who has armed it."""
         self.log(LogLine("error", str(error), 1.0))
         self.close()
-        self.offboard = Offboard(self.offboard.autopilot, options=self.offboard.options)
+        before = self.offboard
+        self.offboard = Offboard(before.autopilot, options=before.options, angle_boost=before.angle_boost, was_armed=before.was_armed,
+                                 forced=before.forced)
         self._clock, self._last_sample = ClockOffset(), None
 
     def _send_command(self, command: int, *words: float) -> None:
@@ -223,14 +230,17 @@ class Mavlink(Component[MavlinkParameters]):
             self.imu(ImuSample(message.time_usec * 1000 + self._clock.offset, tuple(w.tolist()), tuple(f.tolist())))
         elif kind == "PARAM_VALUE" and message.param_id == GUID_OPTIONS and isfinite(message.param_value):
             self.offboard.options = int(message.param_value)
+        elif kind == "PARAM_VALUE" and message.param_id == ANGLE_BOOST and isfinite(message.param_value):
+            self.offboard.angle_boost = int(message.param_value)
         elif kind == "TIMESYNC":
             if message.tc1 == 0:
                 self._send(self._mavlink.timesync_encode(now, message.ts1))
             else:
                 self._clock.answered(message.ts1, message.tc1, now)
-        elif kind == "COMMAND_ACK" and message.command in _COMMANDS and message.result not in (0, 5):
+        elif kind == "COMMAND_ACK" and message.command in (_SET_MODE, _ARM_DISARM) and message.result not in (0, 5):
             word = _RESULTS[message.result] if message.result < len(_RESULTS) else str(message.result)
-            self.log(LogLine("error", f"the autopilot refuses {_COMMANDS[message.command]}: {word}", 1.0))
+            refused = "the mode" if message.command == _SET_MODE else "disarming" if self.offboard.armed else "arming"
+            self.log(LogLine("error", f"the autopilot refuses {refused}: {word}", 1.0))
         elif kind == "STATUSTEXT":
             status = message.text if isinstance(message.text, str) else bytes(message.text).split(b"\0")[0].decode(errors="replace")
             self.log(LogLine("warning" if message.severity <= 4 else "info", f"autopilot: {status}", 1.0))
@@ -252,7 +262,8 @@ class Mavlink(Component[MavlinkParameters]):
         if absence := self._absence_reason(now):
             return absence
         if not self.offboard.takes_thrust:
-            return f"ArduPilot's {GUID_OPTIONS} does not have bit 3 (value {THRUST_AS_THRUST}), so that thrust is a climb rate: set it; not armed"
+            return (f"ArduPilot's {GUID_OPTIONS} needs bit 3 (value {THRUST_AS_THRUST}; else thrust is a climb rate), and {ANGLE_BOOST} must be 0 "
+                    f"(else thrust depends on the tilt): they are {self.offboard.options} and {self.offboard.angle_boost}; not armed")
         return ""
 
     def _absence_reason(self, now: int) -> str:

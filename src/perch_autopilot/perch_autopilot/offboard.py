@@ -10,6 +10,7 @@ ARMED = 128                         # MAV_MODE_FLAG_SAFETY_ARMED
 OFFBOARD, GUIDED_NOGPS = 6 << 16, 20  # custom modes: PX4's main mode, ArduPilot's copter mode
 GUID_OPTIONS = "GUID_OPTIONS"       # parameter of ArduPilot
 THRUST_AS_THRUST = 8                # its bit SetAttitudeTarget_ThrustAsThrust: a thrust, no climb rate
+ANGLE_BOOST = "ATC_ANGLE_BOOST"     # parameter of ArduPilot: 0, or thrust is multiplied by a function of the tilt, which is 0 at 90 deg
 MIN_STREAMING_TIME = 0.5            # set points are sent for so long before the mode is requested; PX4 requires more than 2 Hz [s]
 REQUEST_PERIOD = 1.0                # between two requests [s]
 HEARTBEAT_TIMEOUT = 2.0             # without a heartbeat for so long the autopilot is considered absent [s]
@@ -33,12 +34,19 @@ class Offboard:
         armed: whether the autopilot is armed.
         following: whether the autopilot is in the mode in which it follows set points.
         options: ArduPilot's GUID_OPTIONS; 0 until received.
+        angle_boost: ArduPilot's ATC_ANGLE_BOOST; None until received.
+        was_armed: the autopilot has been armed since the last command with the motors off. If somebody else disarms it then, neither
+            mode nor arming is requested until the next such command.
+        forced: the autopilot was commanded with the motors on since it was last disarmed, so it must disarm also in flight.
     """
 
     autopilot: int = 0
     armed: bool = False
     following: bool = False
     options: int = 0
+    angle_boost: int | None = None
+    was_armed: bool = False
+    forced: bool = False
     _last_heartbeat: float = -1e9
     _streaming_since: float | None = None
     _last_request: float = -1e9
@@ -55,8 +63,9 @@ class Offboard:
 
     @property
     def takes_thrust(self) -> bool:
-        """Whether the autopilot interprets the thrust of a set point as thrust, not as a climb rate."""
-        return self.autopilot == PX4 or (self.autopilot == ARDUPILOT and bool(self.options & THRUST_AS_THRUST))
+        """Whether the autopilot applies the thrust of a set point as it is: not as a climb rate, and at any tilt."""
+        return self.autopilot == PX4 or (
+            self.autopilot == ARDUPILOT and bool(self.options & THRUST_AS_THRUST) and self.angle_boost == 0)
 
     def alive(self, now: float) -> bool:
         """Return whether the last heartbeat is recent at a time [s]."""
@@ -65,7 +74,8 @@ class Offboard:
     def next_request(self, now: float, wanted: bool, streaming: bool) -> Request:
         """Return the request to send at a time, at most one each `REQUEST_PERIOD` seconds.
 
-        The mode is requested with the motors off only: in flight the pilot selects it, and leaves it.
+        The mode is requested with the motors off only: in flight the pilot selects it, and leaves it. Who disarms the autopilot, a
+        pilot or a failsafe, is obeyed until the commands have the motors off, too.
 
         Args:
             now: time [s].
@@ -81,7 +91,11 @@ class Offboard:
             return request
         if not wanted:
             request = Request.DISARM if streaming and self.armed and self.following else request
-        elif not self.armed and self._streaming_since is not None and now - self._streaming_since >= MIN_STREAMING_TIME:
+            self.was_armed = self.was_armed and not streaming
+            self.forced = self.forced and self.armed
+        elif self.armed:
+            self.was_armed = self.forced = True
+        elif not self.was_armed and self._streaming_since is not None and now - self._streaming_since >= MIN_STREAMING_TIME:
             request = Request.ARM if self.following else Request.MODE
         if request is Request.NOTHING or 0.0 <= now - self._last_request < REQUEST_PERIOD:
             return Request.NOTHING

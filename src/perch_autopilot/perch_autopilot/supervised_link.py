@@ -2,7 +2,7 @@
 
 Betaflight before 2026.6 holds the last MSP command for ever. Commands therefore pass through this process, which sends frames at
 a fixed rate from the first command on; without fresh commands the `Watchdog` determines their content. It ends when the node has
-ended and the motors are off.
+ended and the autopilot has received commands to stop the motors; if the link is lost then, it waits for it for a minute.
 
     node -> supervisor   b"C" armed, 4 channels: a command       b"R" bytes: a request for the autopilot       b"H" hover, descent: throttles
                          b"T": the motors turn already
@@ -27,11 +27,12 @@ from pathlib import Path
 from perch_autopilot import msp
 from perch_autopilot.rate_curve import RateCurve
 from perch_autopilot.watchdog import Mode, Watchdog
-from perch_autopilot.link import REOPEN, Link, LinkError
+from perch_autopilot.link import REOPEN, Link, LinkError, PortTaken
 
 RATE = 200.0        # of the frames to the autopilot [Hz]
 COMMAND, THROTTLES = struct.Struct("<?4H"), struct.Struct("<2H")
-_FINAL_FRAMES = 10  # with the motors off, before it ends
+_FINAL_FRAMES = 10  # with the motors off that the autopilot has received before it ends
+_LINK_WAIT = 60.0   # for a lost link to come back, after the motors should have stopped [s]
 
 
 class LinkSupervisor:
@@ -51,7 +52,7 @@ class LinkSupervisor:
         """
         self._address, self._control, self._watchdog, self._period, self._clock = address, control, watchdog, 1.0 / RATE, clock
         self._link: Link | None = Link(address)
-        self._due = self._opened = clock()
+        self._due = self._opened = self._stopped = clock()
         self._reported, self._node_gone, self._final_frames = Mode.DISARMED, False, 0
         self._parser = msp.Parser()
 
@@ -79,22 +80,29 @@ class LinkSupervisor:
         if self._watchdog.mode is not self._reported:
             self._reported = self._watchdog.mode
             self._notify(b"M" + self._reported.value.encode())
-        self._final_frames = self._final_frames + 1 if self._node_gone and self._reported is Mode.DISARMED else 0
+        done = not self._watchdog.command_received  # or the autopilot has received this frame, or is commanded by another process
         if self._link is None and now - self._opened > REOPEN:
             self._opened = now
             try:
                 self._link = Link(self._address)
+            except PortTaken:
+                done = True
             except LinkError:
-                return
+                pass
         if self._watchdog.command_received:
-            self._send(msp.channels(channels) + (msp.request(msp.ATTITUDE) if self._watchdog.needs_attitude(now) else b""))
+            done |= self._send(msp.channels(channels) + (msp.request(msp.ATTITUDE) if self._watchdog.needs_attitude(now) else b""))
+        if not (self._node_gone and self._reported is Mode.DISARMED):
+            self._final_frames, self._stopped = 0, now
+        elif done or now - self._stopped > _LINK_WAIT:
+            self._final_frames += 1
 
-    def _send(self, data: bytes) -> None:
+    def _send(self, data: bytes) -> bool:
+        """Send a frame; return whether it has left as a whole."""
         try:
-            if self._link is not None:
-                self._link.write(data)
+            return self._link is not None and self._link.write(data)
         except LinkError as error:
             self._close_link(error)
+            return False
 
     def _close_link(self, error: LinkError) -> None:
         if self._link is not None:

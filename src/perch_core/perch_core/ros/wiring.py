@@ -26,17 +26,18 @@ Receive = Callable[[Any], None]
 class Publication:
     """A topic that leaves the process if it has subscribers."""
 
-    def __init__(self, publisher: Publisher, to_message: Callable[[Any], Any], always: bool, frequent: bool = False,
-                 observed: bool = False) -> None:
+    def __init__(self, publisher: Publisher, to_message: Callable[[Any], Any], always: bool, on_failure: Callable[[str, Exception], None],
+                 frequent: bool = False, observed: bool = False) -> None:
         """
         Args:
             publisher: publisher of the topic.
             to_message: value to message, or to a serialised one.
             always: publish also without subscribers: a latched topic keeps its last message for late subscribers.
+            on_failure: called with the topic and the exception if a value has no message; the value is dropped.
             frequent: emitted with every IMU sample; its message may be delayed if a neighbour takes the value.
             observed: for observers only; no component in flight waits for it.
         """
-        self._publisher, self._to_message, self._always = publisher, to_message, always
+        self._publisher, self._to_message, self._always, self._on_failure = publisher, to_message, always, on_failure
         self.frequent, self.observed = frequent, observed
         self._has_subscribers, self._last_check = False, 0.0
 
@@ -52,7 +53,12 @@ class Publication:
     def send(self, value: Any) -> None:
         """Publish a value if `has_subscribers`."""
         if self.has_subscribers():
-            self._publisher.publish(self._to_message(value))
+            try:
+                message = self._to_message(value)
+            except Exception as error:  # the node continues, and the other values of a bundle are published
+                self._on_failure(self._publisher.topic_name, error)
+            else:
+                self._publisher.publish(message)
 
 
 class Wiring:

@@ -1,0 +1,19 @@
+"""Publication of values: what cannot be a message is dropped, and the rest is published."""
+
+from __future__ import annotations
+
+import struct
+from types import SimpleNamespace
+
+from perch_core.ros.messages import fast
+from perch_core.ros.wiring import Publication, Wiring
+from perch_core.values import NANOSECONDS, ImuSample
+
+
+def test_a_value_without_a_message_is_dropped_and_the_others_are_published():
+    sent, failures, wiring = [], [], Wiring()
+    publisher = SimpleNamespace(topic_name="/imu", get_subscription_count=lambda: 1, publish=sent.append)
+    publication = Publication(publisher, fast.pack_imu, False, lambda topic, error: failures.append((topic, type(error))))
+    for seconds in (1, 1 << 40, 2):  # the second stamp does not fit into its message
+        wiring.enter(lambda: wiring.emit("/imu", publication, ImuSample(seconds * NANOSECONDS, (0.0,) * 3, (0.0, 0.0, 9.81))))
+    assert len(sent) == 2 and failures == [("/imu", struct.error)]
