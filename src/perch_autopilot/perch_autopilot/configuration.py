@@ -66,7 +66,7 @@ def load_configuration(name: str) -> Configuration:
 class Cli:
     """Betaflight's command line over a stream of bytes."""
 
-    def __init__(self, send: Callable[[bytes], None], receive: Callable[[float], bytes]) -> None:
+    def __init__(self, send: Callable[[bytes], object], receive: Callable[[float], bytes]) -> None:
         """
         Args:
             send: sends bytes to the firmware.
