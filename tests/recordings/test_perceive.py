@@ -7,11 +7,13 @@ from itertools import islice
 import cv2
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 from perch_eval.recordings import command
 from perch_eval.recordings.asl import AslRecording
 from perch_eval.recordings.bag import BagRecording
+from perch_eval.recordings.command import _unused
 from perch_eval.recordings.trajectory import read_trajectory, read_truth
 from recordings import photo_flight
 
@@ -172,6 +174,30 @@ def test_what_cannot_be_done_is_said_in_a_line(files, tmp_path, capsys):
         said = capsys.readouterr().err.strip().splitlines()
         assert len(said) == 1 and said[0].startswith("error: ") and words in said[0], said
     assert perceive(asl, "--out", mine / "below") == 2
+
+
+def test_of_photographs_the_named_camera_is_used(flight, files, tmp_path, capsys):
+    photo, sensors, out = tmp_path / "a.png", tmp_path / "two.yaml", tmp_path / "out"
+    cv2.imwrite(str(photo), flight.images[5])
+    described = yaml.safe_load((files / "mine.yaml").read_text())
+    one, = described["cameras"].values()
+    described["cameras"] = {"down": one, "front": {**one, "focal": [2.0 * focal for focal in one["focal"]]}}
+    sensors.write_text(yaml.safe_dump(described))
+    distance = {}
+    for option in ((), ("--front", "down"), ("--front", "front"), ("--camera", "front")):
+        assert perceive(photo, "--sensors", sensors, *option, "--out", out) == 0
+        distance[option[1:]] = json.loads((out / "detections.json").read_text())["a.png"]["board"]["position"][2]
+    assert distance["down",] == distance[()] < 0.7 * distance["front",]
+    capsys.readouterr()
+    assert perceive(photo, "--sensors", sensors, "--front", "rear", "--out", out) == 2
+    assert "rear: is not one of down, front" in capsys.readouterr().err
+
+
+def test_images_of_one_name_or_stamp_are_all_counted():
+    taken: dict[str, None] = {}
+    for camera in ("cam0", "cam0", "cam1", "cam1", "cam1"):
+        taken[_unused(taken, "1.png", camera)] = None
+    assert list(taken) == ["1.png", "cam0/1.png", "cam1/1.png", "cam1/1.png (2)", "cam1/1.png (3)"]
 
 
 def test_an_interrupt_leaves_no_report(files, tmp_path, monkeypatch, capsys):

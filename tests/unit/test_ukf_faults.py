@@ -96,6 +96,7 @@ def test_a_jump_of_vios_map_is_gated_first_and_accepted_when_it_lasts():
 
 @pytest.mark.parametrize(("make", "outcome"), [
     (lambda s: s._replace(w_B=(34.0, 0.0, 0.0)), ImuOutcome.SATURATED),
+    (lambda s: s._replace(w_B=(24.5, 0.0, 24.5)), ImuOutcome.SATURATED),  # a sensor at 45 deg in the body
     (lambda s: s._replace(f_B=(0.0, 0.0, -156.0)), ImuOutcome.SATURATED),
 ])
 def test_saturated_imu_samples_count_with_a_larger_covariance(make, outcome):

@@ -157,7 +157,7 @@ def _most_dynamic_interval(stamps: np.ndarray, gyro: np.ndarray) -> int:
     """Return the start of the interval of length `SPAN` in which the angular rate varies most [ns]."""
     edges = np.arange(stamps[0], max(stamps[-1] - round(SPAN * 1e9), stamps[0] + 1), 1_000_000_000)
     spans = [gyro[slice(*np.searchsorted(stamps, [edge, edge + round(SPAN * 1e9)]))] for edge in edges]
-    return int(edges[int(np.argmax([np.linalg.norm(span - span.mean(axis=0), axis=1).mean() for span in spans]))])
+    return int(edges[int(np.argmax([np.linalg.norm(span - span.mean(axis=0), axis=1).mean() if len(span) else 0.0 for span in spans]))])
 
 
 def gyro_rates(turns: np.ndarray, stamps: np.ndarray, gyro_C: np.ndarray) -> np.ndarray:

@@ -34,7 +34,8 @@ def check(recording: Recording, events: Iterator[Event] | None = None) -> Report
     if recording.damage:
         report.add("recording", recording.damage, warning=True)
     if not stamps:
-        report.add("imu", "there is no IMU: only single images can be evaluated", warning=True)
+        missing = "the sensor file describes no IMU" if sensors is not None and sensors.imu is None else "there is no IMU"
+        report.add("imu", f"{missing}: only single images can be evaluated", warning=True)
     imu = np.array(samples).reshape(-1, 6)
     times = np.array(stamps, np.int64)
     if len(times):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def _perceive(args: argparse.Namespace) -> int:
     for node in overrides:
         if node not in NODES:
             raise PerchError(f"-p {node}: is not one of {', '.join(NODES)}")
-    recording = open_recording(args.recording, load_sensors(args.sensors) if args.sensors else None)
+    recording = open_recording(args.recording, load_sensors(args.sensors) if args.sensors else None, args.front or args.camera)
     load_board(args.board)
     truth = read_truth(recording, args.truth)
     output_folder(args.out)
@@ -231,11 +232,14 @@ def _detect_in_images(args: argparse.Namespace, recording: Recording, overrides:
     appearances = {camera: "red" if camera in cameras and cameras[camera].colour else "plain" for camera in recording.images}
     wires = {camera: node_config("powerline_mapper", PowerlineMapperConfig, {"detection.appearance": appearance}, overrides).detection
              for camera, appearance in appearances.items()}
+    chosen = args.front or args.camera
+    if chosen and chosen not in recording.images:
+        raise ConfigError("--front" if args.front else "--camera", chosen, f"is not one of {', '.join(recording.images)}")
     for event in recording.read():
         image = event.value
-        if not isinstance(image, CameraImage):
+        if not isinstance(image, CameraImage) or (chosen and event.source != chosen):
             continue
-        name = getattr(image, "path", Path(str(image.stamp))).name
+        name = _unused(detections, getattr(image, "path", Path(str(image.stamp))).name, event.source)
         sensor = cameras.get(event.source)
         mount = sensor.mount(event.source) if sensor else guessed_mount(event.source, image.width, image.height)
         try:
@@ -248,13 +252,22 @@ def _detect_in_images(args: argparse.Namespace, recording: Recording, overrides:
     problems += [recording.damage] if recording.damage else []
     tags, poses = sum(len(d["tags"]) for d in detections.values()), sum("board" in d for d in detections.values())
     rows = [("recording", str(recording.path.resolve())),
-            ("images", f"{len(detections)}" + ("" if recording.sensors else "; the camera is not calibrated")), ("tags", str(tags)),
+            ("images", f"{len(detections)}" + ("; the camera is not calibrated" if recording.sensors is None else
+                                               "; the sensor file describes no IMU" if recording.sensors.imu is None else "")), ("tags", str(tags)),
             ("board", f"posed in {poses}"), ("wires", str(sum(len(d["wires"]) for d in detections.values())))]
     rows += [("problem", problem) for problem in problems]
     write_json(args.out / "detections.json", detections)
     figures = {"images": len(detections), "tags": tags, "boards": poses, "problems": problems}
     ReportContent(figures, rows, pictures={"What was found": gallery.images}).write(args.out, recording)
     return 0 if detections else 1
+
+
+def _unused(taken: Container[str], name: str, camera: str) -> str:
+    """Return an image's name, made unique: images of several cameras share names or stamps, and a driver may not stamp at all."""
+    if name not in taken:
+        return name
+    numbered = (f"{camera}/{name} ({k})" for k in count(2))
+    return next(other for other in chain([f"{camera}/{name}"], numbered) if other not in taken)
 
 
 main = command(parser, _perceive)

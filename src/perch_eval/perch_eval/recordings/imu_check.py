@@ -42,7 +42,7 @@ def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSe
         clipped = (np.abs(gyro) >= 0.99 * sensor.gyro_range).any(axis=1) | (np.abs(accel) >= 0.99 * sensor.accel_range).any(axis=1)
         if clipped.any():
             report.add("imu range", f"{int(clipped.sum())} samples are at the range of the sensor", warning=True)
-    rests = [(1e-9 * float(stamps[last] - stamps[first]), first, last) for first, last in stretches_at_rest(stamps, imu)]
+    rests = [(1e-9 * float(stamps[last - 1] - stamps[first]), first, last) for first, last in stretches_at_rest(stamps, imu)]
     duration, first, last = max(rests, default=(0.0, 0, 0))
     report.figures["still_s"] = duration
     at_start = max((still for still, begin, _ in rests if stamps[begin] - stamps[0] < 0.5e9), default=0.0)

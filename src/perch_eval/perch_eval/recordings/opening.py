@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from perch_core.errors import ConfigError
 from perch_core.sensors import Sensors
 from perch_eval.recordings.asl import AslRecording, root_of
 from perch_eval.recordings.bag import BagRecording, is_bag
@@ -21,16 +22,21 @@ def image_files(path: Path) -> list[Path]:
 
 class ImageFolder(Recording):
     """Image files without stamps."""
-    def __init__(self, path: Path, sensors: Sensors | None) -> None:
+
+    def __init__(self, path: Path, sensors: Sensors | None, camera: str | None) -> None:
         """
         Raises:
             RecordingError: there is no image.
+            ConfigError: the sensor file has no such camera.
         """
         super().__init__(path, sensors)
         self.files = image_files(path)
         if not self.files:
             raise RecordingError(f"{path}: no image in it")
-        self.camera = next(iter(sensors.cameras), "camera") if sensors is not None else "camera"
+        cameras = [*sensors.cameras] if sensors is not None else ["camera"]
+        if camera is not None and camera not in cameras:
+            raise ConfigError("--camera, --front", camera, f"is not one of {', '.join(cameras)}")
+        self.camera = camera or next(iter(cameras), "camera")
         self.images = {self.camera: len(self.files)}
 
     def events(self) -> Iterator[Event]:
@@ -46,12 +52,13 @@ class ImageFolder(Recording):
         self.damage = f"cannot be decoded: {', '.join(bad)}" if bad else ""
 
 
-def open_recording(path: Path, sensors: Sensors | None) -> Recording:
+def open_recording(path: Path, sensors: Sensors | None, camera: str | None = None) -> Recording:
     """Open the recording at a path.
 
     Args:
         path: a bag, a folder in the ASL format, a folder of images or an image.
         sensors: its calibration; None: the recording's own, if there is one.
+        camera: that of a folder of images or an image; None: the first of `sensors`.
 
     Raises:
         RecordingError: it is none of these, or cannot be read.
@@ -64,6 +71,6 @@ def open_recording(path: Path, sensors: Sensors | None) -> Recording:
     if path.is_dir() and root_of(path) is not None:
         return AslRecording(path, sensors)
     if image_files(path):
-        return ImageFolder(path, sensors)
+        return ImageFolder(path, sensors, camera)
     raise RecordingError(f"{path}: is no recording: neither a bag (.bag, .mcap, .db3, a folder with metadata.yaml), nor a folder in the "
                          "format of EuRoC (mav0/cam0/data.csv), nor images")

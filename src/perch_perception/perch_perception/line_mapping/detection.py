@@ -234,13 +234,15 @@ def _width(edges: np.ndarray, camera: Camera) -> float:
     """Angle between the planes that touch a wire on both sides [rad], from its edges in the image (n, 2, 2).
 
     In an oblique view the wire's direction differs from that of its image, so a plane is fitted to each side. 0 where an edge is
-    unknown (nan), or the wire is too thin to be measured.
+    unknown (nan) or beyond the lens's calibration, or the wire is too thin to be measured.
     """
     if np.isnan(edges).any():
         return 0.0
     normals = []
     for side in (0, 1):
         rays = camera.unproject(edges[:, side])
+        if not np.isfinite(rays).all():
+            return 0.0
         normal = np.linalg.eigh(rays.T @ rays)[1][:, 0]
         off = np.abs(rays @ normal)
         rays = rays[off <= 3.0 * np.median(off)]  # where another wire crosses, the edge is that one's

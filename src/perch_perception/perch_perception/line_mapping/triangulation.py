@@ -24,6 +24,7 @@ from perch_perception.line_mapping.observation import LineObservation
 
 MIN_RATIO = 0.03   # least sigma2/sigma1 of the planes' normals; below it the depth is not determined
 POSE_POSITION, POSE_ROTATION = 0.006, np.radians(0.1)  # 1 sigma of the camera's pose from image to image [m, rad]
+_EXACT = 1e-6      # 1 sigma of a mount that is known exactly, for a regular information matrix [rad]
 SAG = 0.03         # prior 1 sigma of a wire's curvature (0.02 is 16 cm of sag in a span of 8 m) [1/m]
 WIDTH_ERROR = 0.01      # error of a wire's width in an image, beside that of its edges: share of it
 WIDTH_EDGE_ERROR = 0.3  # error of a wire's edges in an image beside that of its rays: share of it
@@ -192,7 +193,7 @@ def _information_filter(by_rays, by_widths, walk, settings, curvature, mount):
     many they are, they do not determine the wire's place any better.
     """
     parts, slopes = by_rays[0] + by_widths[0], by_rays[1] + by_widths[1]
-    tight = np.concatenate([np.zeros(4), [1.0 / SAG**2], np.full(3, settings.mount_rotation**-2), [1e-6]])  # of the radius nothing is known
+    tight = np.concatenate([np.zeros(4), [1.0 / SAG**2], np.full(3, max(settings.mount_rotation, _EXACT)**-2), [1e-6]])  # of the radius nothing is known
     information, gradient = np.diag(tight), tight * np.concatenate([np.zeros(4), [curvature], mount, [0.0]])
     for part, slope, variance in zip(parts, slopes, walk):
         if variance > 0.0:

@@ -91,6 +91,8 @@ class TagDetector:
                 rejected.append(f"tag {number} does not belong to the board")
             elif not np.all(self.camera.contains(corners, margin=1.0)):
                 rejected.append(f"tag {number} reaches beyond the image")
+            elif not np.isfinite(self.camera.unproject(corners)).all():
+                rejected.append(f"tag {number} reaches beyond what the lens's calibration covers")
             elif not any(number == other and np.linalg.norm(corners.mean(axis=0) - c.mean(axis=0)) < 0.5 * side for other, c in kept):
                 kept.append((number, corners))
         kept.sort(key=lambda entry: entry[0])
