@@ -432,6 +432,17 @@ def test_a_link_that_comes_back_in_time_flies_on():
     assert dog.channels(0.73) == (*STICKS, ON, OFF)
 
 
+def test_a_controller_that_is_started_again_in_flight_does_not_stop_the_motors():
+    dog = watchdog()
+    dog.command(0.0, True, STICKS)
+    assert dog.channels(0.6)[2] == 1420 and dog.mode is Mode.DESCENDING
+    dog.command(1.0, False, CENTRED)
+    assert dog.channels(1.0)[2] == 1420 and dog.channels(3.9)[4] == ON and dog.channels(4.1)[4] == OFF
+    dog.command(4.2, False, CENTRED)                            # the descent has ended: it may arm again
+    dog.command(4.3, True, STICKS)
+    assert dog.channels(4.3)[4] == ON
+
+
 def test_a_clock_that_jumps_back_turns_the_motors_off():
     dog = watchdog()
     dog.command(100.0, True, STICKS)

@@ -64,7 +64,20 @@ def test_what_flies_already_is_asked_for_nothing():
     """A node that is started anew in flight: neither the pilot's mode, nor a vehicle that follows without set points, is its to change."""
     assert asked(Offboard(autopilot=PX4, armed=True), 5.0) == []
     following = Offboard(autopilot=PX4, armed=True, following=True)
-    assert asked(following, 5.0, wanted=False, streaming=False) == [] and Request.DISARM in asked(following, 1.0, start=5.0, wanted=False)
+    assert asked(following, 5.0, wanted=False, streaming=False) == [] == asked(following, 1.0, start=5.0, wanted=False, streaming=False)
+
+
+@pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
+def test_a_controller_that_is_started_again_in_flight_does_not_disarm(autopilot):
+    machine = Offboard(autopilot=autopilot, armed=True, following=True)
+    assert asked(machine, 1.0) == [] and machine.commanding
+    assert asked(machine, 1.0, start=1.0, wanted=False, streaming=False) == [] and not machine.commanding
+    assert asked(machine, 3.0, start=2.0, wanted=False) == []
+    asked(machine, 0.1, start=5.0)                              # it commands the motors on: it is obeyed again
+    assert asked(machine, 1.0, start=5.1, wanted=False) == [Request.DISARM]
+    machine.commanding, machine.armed = False, False            # its failsafe has landed it
+    asked(machine, 0.1, start=7.0, wanted=False)
+    assert asked(machine, 1.5, start=7.1)[0] is Request.ARM
 
 
 def test_nothing_is_asked_of_an_autopilot_that_is_gone_or_without_set_points():
@@ -104,6 +117,12 @@ class Autopilot:
 
     def say(self, message) -> None:
         self.link.sendall(message.pack(self.mavlink))
+
+    def command_disarmed(self) -> None:
+        """Give the node commands with the motors off before its autopilot is armed."""
+        self.heard()
+        self.node.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
+        self.heard()
 
     def heard(self, seconds: float = 0.005) -> dict:
         """What the node says while it is polled for a time, the last of each kind."""
@@ -247,9 +266,30 @@ def test_it_arms_by_its_own_way_and_says_why_not(autopilot):
     assert "refuses arming: TEMPORARILY_REJECTED" in said and "Preflight Fail: Accel #0 uncalibrated" in said
 
 
+def test_set_points_stop_where_a_controller_is_started_again_in_flight(autopilot):
+    """Those of a disarmed controller would have no thrust."""
+    m = autopilot.mavlink
+
+    def sent(armed: bool | None) -> set:
+        autopilot.say(m.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
+        kinds = set()
+        for _ in range(120):
+            if armed is not None:
+                autopilot.node.on_rates_thrust(RatesThrust(0, armed, (0.0, 0.0, 0.0), 9.81 if armed else 0.0))
+            kinds |= set(autopilot.heard())
+        return kinds & {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}
+
+    assert sent(True) == {"SET_ATTITUDE_TARGET"}
+    sent(None)
+    assert sent(False) == set() and "was the controller started again?" in autopilot.got["log"][-1].text
+    assert sent(True) == {"SET_ATTITUDE_TARGET"}
+    assert sent(False) == {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}
+
+
 def test_it_disarms_in_flight_what_it_has_flown(autopilot):
     """Both autopilots refuse to disarm in flight unless it is forced."""
     m = autopilot.mavlink
+    autopilot.command_disarmed()
 
     def disarmed(commanded: bool) -> list:
         orders = []
@@ -289,6 +329,7 @@ def test_a_hosts_clock_that_jumps_is_one_line_and_everything_goes_on(autopilot):
             kinds |= set(said)
         return kinds
 
+    autopilot.command_disarmed()
     counter = itertools.count()
     wanted = {"HEARTBEAT", "TIMESYNC", "SET_ATTITUDE_TARGET", "COMMAND_LONG"}  # disarmed is wanted: it is ordered again and again
     assert second() | second() >= wanted

@@ -167,6 +167,7 @@ class Mavlink(Component[MavlinkParameters]):
         """Process received messages; send the command while it is fresh; once a second, heartbeat and TIMESYNC."""
         if self._now is None or (jump := clock_jump(self._now, now)):
             self._command, self._clock, self._start_time, self._last_heartbeat = None, ClockOffset(), now, now - NANOSECONDS
+            self.offboard.set_time(now * 1e-9)
             if self._now is not None:
                 self.warn(jump)
         self._now = now
@@ -174,6 +175,10 @@ class Mavlink(Component[MavlinkParameters]):
             self._handle_message(message, now)
         command = self._command if self.offboard.takes_thrust else None
         if command is not None and not 0 <= now - self._command_time <= _STALE:
+            command = None
+        if command is not None and not command.armed and self.offboard.armed and not self.offboard.commanding:
+            self.log(LogLine("error", "commands have the motors off, but a flight may have begun before them (was the controller started "
+                                      "again?): not obeyed until the autopilot is disarmed by its pilot or its failsafe", 2.0))
             command = None
         if command is not None:
             self._send_set_point(command)
@@ -210,7 +215,7 @@ class Mavlink(Component[MavlinkParameters]):
         self.close()
         before = self.offboard
         self.offboard = Offboard(before.autopilot, options=before.options, angle_boost=before.angle_boost, was_armed=before.was_armed,
-                                 forced=before.forced)
+                                 forced=before.forced, commanding=before.commanding)
         self._clock, self._last_sample = ClockOffset(), None
 
     def _send_command(self, command: int, *words: float) -> None:

@@ -13,6 +13,7 @@ THRUST_AS_THRUST = 8                # its bit SetAttitudeTarget_ThrustAsThrust: 
 ANGLE_BOOST = "ATC_ANGLE_BOOST"     # parameter of ArduPilot: 0, or thrust is multiplied by a function of the tilt, which is 0 at 90 deg
 MIN_STREAMING_TIME = 0.5            # set points are sent for so long before the mode is requested; PX4 requires more than 2 Hz [s]
 REQUEST_PERIOD = 1.0                # between two requests [s]
+RESTART_GAP = 0.5                   # commands that have stopped for longer may come from a controller that was started again [s]
 HEARTBEAT_TIMEOUT = 2.0             # without a heartbeat for so long the autopilot is considered absent [s]
 
 
@@ -38,6 +39,8 @@ class Offboard:
         was_armed: the autopilot has been armed since the last command with the motors off. If somebody else disarms it then, neither
             mode nor arming is requested until the next such command.
         forced: the autopilot was commanded with the motors on since it was last disarmed, so it must disarm also in flight.
+        commanding: commands have come without a gap since the motors were commanded on, or since the autopilot was disarmed. Only then
+            are commands with the motors off obeyed: a controller that was started again in flight is disarmed.
     """
 
     autopilot: int = 0
@@ -47,8 +50,10 @@ class Offboard:
     angle_boost: int | None = None
     was_armed: bool = False
     forced: bool = False
+    commanding: bool = False
     _last_heartbeat: float = -1e9
     _streaming_since: float | None = None
+    _last_streaming: float = -1e9
     _last_request: float = -1e9
 
     @property
@@ -60,6 +65,10 @@ class Offboard:
         """Record a heartbeat of the autopilot at a time [s]."""
         self._last_heartbeat, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
         self.following = custom_mode == self.mode
+
+    def set_time(self, now: float) -> None:
+        """Take a time [s] of a clock that has jumped; commands have had no gap by it."""
+        self._last_streaming = now
 
     @property
     def takes_thrust(self) -> bool:
@@ -86,11 +95,15 @@ class Offboard:
             self._streaming_since = None
         elif self._streaming_since is None or now < self._streaming_since:
             self._streaming_since = now
+        if streaming:
+            self._last_streaming = now
+        continued = self.commanding and 0.0 <= now - self._last_streaming <= RESTART_GAP
+        self.commanding = continued or streaming and (wanted or self.alive(now) and not self.armed)
         request = Request.NOTHING
         if not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
             return request
         if not wanted:
-            request = Request.DISARM if streaming and self.armed and self.following else request
+            request = Request.DISARM if streaming and self.commanding and self.armed and self.following else request
             self.was_armed = self.was_armed and not streaming
             self.forced = self.forced and self.armed
         elif self.armed:

@@ -81,11 +81,16 @@ class Watchdog:
     def command(self, now: float, armed: bool, sticks: Channels) -> None:
         """Record a command.
 
+        A descent without commands is ended by a command with the motors on, not by one with the motors off: a controller that was
+        started again in flight is disarmed.
+
         Args:
             now: time [s].
             armed: whether the motors are to turn.
             sticks: roll, pitch, throttle, yaw [us].
         """
+        if not armed and self.mode is Mode.DESCENDING:
+            return
         if armed and not (self._armed_command or self._motors_turning):
             self._armed_since = now
         self._armed_command, self._command_time, self._sticks = armed, now, sticks
