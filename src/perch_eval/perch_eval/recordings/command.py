@@ -227,7 +227,8 @@ def _detect_in_images(args: argparse.Namespace, recording: Recording, overrides:
         if name not in IN_IMAGES:
             raise PerchError(f"-p {name}: does not apply to images without an IMU; these do: {', '.join(IN_IMAGES)}")
     target = node_config("target_localizer", TargetLocalizerConfig, {"board": args.board}, overrides)
-    board, gallery, problems, detections = load_board(target.board), Gallery(24), [], {}
+    board, gallery, problems = load_board(target.board), Gallery(24), []
+    detections: dict[str, dict[str, Any]] = {}
     cameras = recording.sensors.cameras if recording.sensors else {}
     appearances = {camera: "red" if camera in cameras and cameras[camera].colour else "plain" for camera in recording.images}
     wires = {camera: node_config("powerline_mapper", PowerlineMapperConfig, {"detection.appearance": appearance}, overrides).detection

@@ -95,9 +95,10 @@ class Tracker:
         self._pixels, self._ids, self._next = np.zeros((0, 2), np.float32), np.zeros(0, int), 0
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         rays = camera.unproject(np.stack([u, v], axis=-1)[::4, ::4].astype(float))
-        mask, has_ray = (cv2.resize(part.astype(np.uint8) * 255, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
-                         for part in (np.nan_to_num(rays[..., 2], nan=-1.0) > np.cos(_VIEW), np.isfinite(rays[..., 2])))
-        mask &= cv2.erode(has_ray, np.ones((13, 13), np.uint8))  # beyond its calibration a lens has no rays: 4 px of the grid, and `_REACH`
+        # beyond its calibration a lens has no rays: 4 px of the grid, and `_REACH`
+        in_view, has_ray = (cv2.resize(part.astype(np.uint8) * 255, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+                            for part in (np.nan_to_num(rays[..., 2], nan=-1.0) > np.cos(_VIEW), np.isfinite(rays[..., 2])))
+        mask = cv2.bitwise_and(in_view, cv2.erode(has_ray, np.ones((13, 13), np.uint8)))
         border = 8  # a patch at the border has no gradient beyond it
         mask[:border], mask[-border:], mask[:, :border], mask[:, -border:] = 0, 0, 0, 0
         self._view = mask
