@@ -120,6 +120,9 @@ def test_a_flight_that_begins_anew_is_answered_anew():
     before = len(states)
     fly(vio, 0.5)
     assert len(states) == 2 * before and any("estimator reset" in line.text for line in log)
+    for first, again in zip(states[:before], states[before:]):  # without the drift of the flight before, nor its age
+        assert np.array_equal(first.p_WB, again.p_WB) and np.array_equal(first.covariance, again.covariance)
+    assert all(np.diag(state.covariance).min() > 0.0 for state in states)
 
 
 def test_a_camera_that_there_is_not_is_refused(monkeypatch):

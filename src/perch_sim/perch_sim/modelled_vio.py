@@ -46,7 +46,6 @@ class ModelledVio(Component[VioModelParameters]):
         if CAMERA not in vehicle.mounts:
             raise ConfigError("vio_model", "vehicle", f"{vehicle.name} has no camera {CAMERA!r}")
         self._offset = nanoseconds(vehicle.mounts[CAMERA].stamp_offset)
-        self._model = VioModel(config, seeding.stream(config.seed, "vio_model"))
         imu = true_imu(vehicle.imu, config.seed)
         turn_on = Imu(imu, seeding.stream(config.seed, "imu")).bias
         self._biases = BiasModel(imu, np.concatenate([turn_on[3:], turn_on[:3]]),
@@ -56,6 +55,7 @@ class ModelledVio(Component[VioModelParameters]):
         self._reset()
 
     def _reset(self) -> None:
+        self._model = VioModel(self.config, seeding.stream(self.config.seed, "vio_model"))
         self._history, self._newest = StateHistory(HISTORY_LENGTH), 0
         self._frames: deque[int] = deque(maxlen=MAX_PENDING_FRAMES)  # stamps of frames without an estimate
         self._last_frame = 0
