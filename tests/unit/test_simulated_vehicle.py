@@ -8,9 +8,10 @@ import signal
 
 import numpy as np
 import pytest
+import yaml
 from perch_core import config
 from perch_core.errors import ConfigError
-from perch_core.values import MotorCommand
+from perch_core.values import MotorCommand, RatesThrust
 from perch_sim.contact_event import ContactState
 from perch_sim.drawing import ProcessRendering, OnDemandRendering
 from perch_sim.lockstep import Schedule, flight_tasks
@@ -224,3 +225,47 @@ def test_cameras_that_are_not_simulated_are_refused(tmp_path):
     (tmp_path / "other.yaml").write_text(text)
     with pytest.raises(ConfigError, match="cameras.rear: is not one of down, front"):
         vehicle(scenario=dataclasses.replace(SCENARIO, vehicle=str(tmp_path / "other.yaml")))
+
+
+def test_a_vehicle_may_have_one_camera(tmp_path):
+    content = config.read_yaml(config.find("vehicles", "snapdragon"))
+    (tmp_path / "one.yaml").write_text(yaml.safe_dump(content | {"cameras": {"down": content["cameras"]["down"]}}))
+    scenario = dataclasses.replace(SCENARIO, vehicle=str(tmp_path / "one.yaml"))
+    flown, seen = vehicle("all", scenario)
+    arrivals = [arrival for _ in range(60) for arrival in flown.advance()]
+    assert {arrival.camera for arrival in arrivals} == {"down"} and arrivals[0].image.pixels().std() > 1.0 and not seen["info_front"]
+    with pytest.raises(ConfigError, match="one.yaml: cameras.front: missing"):
+        vehicle("front", scenario)
+
+
+class Firmware:
+    """Stands in for Betaflight: motors follow throttle and arming switch."""
+
+    def __init__(self, loaded) -> None:
+        pass
+
+    def step(self, gyro, accel, attitude, channels):
+        return (max(0.055, 0.055 + 0.945e-3 * (channels[2] - 1000)) if channels[4] > 1500 else 0.0,) * 4
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_controller_that_is_started_again_does_not_end_the_descent_of_a_firmware(monkeypatch):
+    monkeypatch.setattr("perch_autopilot.loop.Sitl", Firmware)
+    flown, _ = vehicle(scenario=dataclasses.replace(SCENARIO, vehicle="betaflight_unidentified"))
+    simulation = flown.simulation
+    simulation.plant.place(np.array([-1.0, 0.0, 3.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), np.full(4, 1268.0))
+
+    def fly(steps, armed):
+        for _ in range(steps):
+            if armed is not None:
+                flown.on_rates_thrust(RatesThrust(flown.time, armed, (0.0, 0.0, 0.0), 9.81 if armed else 0.0))
+            flown.advance()
+        return simulation.plant.rotor_speed.min()
+
+    assert fly(100, True) > 1000.0 and simulation.motors.starts == 1
+    assert fly(400, None) > 1000.0   # level, then descending
+    assert fly(100, False) > 1000.0  # a controller that was started again sends commands with the motors off
+    assert fly(10, True) > 1000.0
+    assert fly(300, False) < 50.0    # in command again, it stops them

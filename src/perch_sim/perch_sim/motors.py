@@ -56,11 +56,9 @@ class Motors:
         if armed:
             self._speeds = np.array([min(max(s, self._low), self._high) for s in values])
 
-    def aim(self, speeds: np.ndarray, now: int | None = None) -> None:
-        """Set the target speeds of an inner loop, within the armed range (4,) [rad/s]. They are valid as long as the last
-        command; a loop that handles the loss of commands itself passes the time [ns], which restarts the time-out."""
+    def aim(self, speeds: np.ndarray) -> None:
+        """Set the target speeds of an inner loop, within the armed range (4,) [rad/s]; they are valid as long as the last command."""
         self._speeds = speeds
-        self._received = self._received if now is None else now
 
     def target(self, now: int) -> np.ndarray:
         """Return the target speeds of the rotors, (4,) [rad/s]; zero if the motors are stopped."""

@@ -21,4 +21,4 @@ class VehicleParameters:
         "powerline_mapper, mission, recorder; an empty name: none")
     lockstep_timeout: float = quantity(60.0, unit="s", above=0.0, high=3600.0,
                                        doc="wall-clock time after which a silent participant is dropped, and one that never came, then at least 60 s")
-    cameras: str = choice("all", options=tuple(CAMERAS), doc="cameras that take images; none: for fast runs")
+    cameras: str = choice("all", options=tuple(CAMERAS), doc="cameras that take images; all: those that the vehicle has; none: for fast runs")

@@ -16,6 +16,7 @@ from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
     NANOSECONDS, AttitudeThrust, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RatesThrust, RotorState,
     Transform, limits, rotated, seconds)
+from perch_core.vehicle import load_vehicle
 from perch_sim.camera_stream import Delivery
 from perch_sim.contact_event import ContactState
 from perch_sim.drawing import Rendering, ProcessRendering
@@ -70,13 +71,14 @@ class SimulatedVehicle(Component[VehicleParameters]):
             drawing: renders images, `ProcessRendering` or `OnDemandRendering`.
 
         Raises:
-            ConfigError: the scenario, its vehicle or its board does not exist, or has a camera that is not simulated.
+            ConfigError: the scenario, its vehicle or its board does not exist; the vehicle has a camera that is not simulated, or
+                lacks the one that is to take images.
             PerchError: the vehicle's firmware is not on this machine, or does not start.
         """
         super().__init__(config)
         scenario = load_scenario(config.scenario) if scenario is None else scenario
         self.scenario = scenario = replace(scenario, vehicle=config.vehicle) if config.vehicle else scenario
-        cameras = CAMERAS[config.cameras]
+        cameras = self._rendered_cameras()
         self._drawing = drawing(scenario, config.seed, cameras) if cameras else None
         try:
             self.simulation = Simulation(scenario, config.seed, self._drawing)
@@ -92,6 +94,13 @@ class SimulatedVehicle(Component[VehicleParameters]):
         self._broken: set[str] = set()           # cameras without images for the rest of the flight
         self._diagnosed, self._last_counts = self.time, (0, 0)  # time of the last diagnostics; steps and missed commands by then
         self._counts = {"commands_missed": 0, "commands_refused": 0, "images_late": 0}
+
+    def _rendered_cameras(self) -> tuple[str, ...]:
+        """Return the names of the cameras that take images: of `all`, those that the vehicle has."""
+        wanted, mounts = CAMERAS[self.config.cameras], load_vehicle(self.scenario.vehicle).mounts
+        if len(wanted) == 1 and wanted[0] not in mounts:
+            raise ConfigError(f"vehicles/{self.scenario.vehicle}", f"cameras.{wanted[0]}", "missing; it is to take images")
+        return tuple(name for name in wanted if name in mounts)
 
     def warm_up(self) -> None:
         """Restrict OpenCV to one thread, as its threads would compete with the flight for the processors."""

@@ -106,16 +106,23 @@ class Simulation:
         if self.motors.starts != self._starts:
             self._starts = self.motors.starts
             self.plant.release()
-        if self.loop is not None:
-            speeds = self.loop.speeds(self.time, self.state.x, self.plant.rotor_speed, self._sample)
-            self.motors.aim(speeds, self.time if self.loop.handles_command_timeout else None)
-        result = self.plant.advance(self.motors.target(self.time))
+        result = self.plant.advance(self._target_speeds())
         for state in result.states:
             self._history.append(state)
         for camera in self.cameras.values():
             camera.expose(self.time, self._history)
         self._sample = self._imu.sample(result.inertial)
         return Output(self.time, self._sample, result.states[-1], result.contacts)
+
+    def _target_speeds(self) -> np.ndarray:
+        """Return the target speeds of the rotors, (4,) [rad/s]; a loop that handles the loss of commands arms and stops them itself."""
+        if self.loop is None:
+            return self.motors.target(self.time)
+        speeds = self.loop.speeds(self.time, self.state.x, self.plant.rotor_speed, self._sample)
+        if self.loop.handles_command_timeout:
+            return np.asarray(speeds)
+        self.motors.aim(speeds)
+        return self.motors.target(self.time)
 
     def close(self) -> None:
         """End the inner loop's firmware, if there is one."""
