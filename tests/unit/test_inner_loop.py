@@ -155,6 +155,14 @@ def test_the_loop_follows_a_step_with_its_lag(axis, factor):
     assert np.abs(done - expected)[-20:].max() < 0.03
 
 
+@pytest.mark.parametrize("vehicle, change", [("snapdragon", {"loop_lag_factor": 0.6}), ("snapdragon", {"voltage_factor": 0.9}),
+                                             ("snapdragon_rates", {"voltage_factor": 0.9}), ("betaflight", {"loop_lag_factor": 1.2})])
+def test_a_disturbance_without_effect_on_the_vehicle_is_refused(vehicle, change):
+    scenario = replace(SCENARIO, vehicle=vehicle, disturbance=replace(SCENARIO.disturbance, **change))
+    with pytest.raises(ConfigError, match=f"disturbance.{next(iter(change))}: .* has no effect on {vehicle}"):
+        Simulation(scenario, 1)
+
+
 def said(vehicle):
     """What the simulated vehicle complains of."""
     lines = []

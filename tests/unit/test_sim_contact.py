@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 from perch_core import so3
+from perch_core.errors import ConfigError, PerchError
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_sim.contact_event import ContactState
 from perch_sim.plant import Plant
-from perch_sim.scenario import Adhesion, Target, load_scenario
+from perch_sim.scenario import Adhesion, Disturbance, Target, load_scenario
 
 SCENARIO = load_scenario("surface_90")
 VEHICLE = load_vehicle(SCENARIO.vehicle)
@@ -181,6 +182,35 @@ def test_a_moving_pad_carries_the_vehicle_away():
     assert first(events).tangential_speed < 0.12  # what gravity adds on the way
     assert plant.state.v_WB[1] == pytest.approx(0.3, abs=1e-3)
     np.testing.assert_allclose(plant.state.p_WB[1], 0.3, atol=0.01)
+
+
+def test_a_plate_is_held_at_rest_or_refused_but_never_shaken():
+    """The longer the arm, the stiffer the hold for steps of 0.5 ms."""
+    scenario = dataclasses.replace(SCENARIO, disturbance=Disturbance(inertia_factor=0.3))
+    for offset in (0.04, 0.1, 0.15, 0.17):
+        vehicle = dataclasses.replace(VEHICLE, perch_offset=offset)
+        plant = Plant(scenario, vehicle, seed=1, start=1_000_000_000)
+        pad = scenario.surface
+        plant.place(pad.p_WS + (offset + 0.005) * pad.normal, so3.quat_from_matrix(pad.R_WS), -0.5 * pad.normal, np.zeros(3), OFF)
+        run(plant, 2.0)
+        assert plant.contact.attached and np.linalg.norm(plant.state.w_WB_B) < 0.1, offset
+    with pytest.raises(ConfigError, match="vehicles/snapdragon: perch_offset: 0.3 m is too far for 0.25 kg"):
+        Plant(scenario, dataclasses.replace(VEHICLE, perch_offset=0.3), seed=1, start=1_000_000_000)
+
+
+def test_a_surface_effect_needs_propellers_of_a_size():
+    scenario = dataclasses.replace(SCENARIO, disturbance=Disturbance(surface_effect=True))
+    with pytest.raises(ConfigError, match="disturbance.surface_effect: needs the propeller_radius of snapdragon"):
+        Plant(scenario, dataclasses.replace(VEHICLE, propeller_radius=0.0), seed=1, start=1_000_000_000)
+
+
+@pytest.mark.parametrize("index", [7, 12])
+def test_a_state_that_is_not_finite_ends_the_flight(index):
+    plant = plant_of()
+    plant.place(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), OFF)
+    plant._x[index] = np.nan
+    with pytest.raises(PerchError, match="not finite 0.00. s after the start"):
+        run(plant, 0.01)
 
 
 def test_adhesion_limits_are_those_of_the_material():

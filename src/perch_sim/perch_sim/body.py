@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.errors import ConfigError
 from perch_core.vehicle import Vehicle
 from perch_sim.scenario import Disturbance
 
@@ -45,6 +46,13 @@ class Body(NamedTuple):
     hold: np.ndarray                # stiffness and damping of an attached plate: [N/m, N s/m, N m/rad, N m s/rad]
 
 
+def hold_rate(body: Body) -> float:
+    """Return the greatest rate at which the hold damps a motion [1/s]: of the plate at its arm, or of a turn."""
+    rates = body.hold[3] / body.inertia
+    rates[:2] += body.hold[1] * (1.0 / body.mass + body.plate_offset**2 / body.inertia[:2])
+    return float(rates.max())
+
+
 def _contact_points(vehicle: Vehicle) -> np.ndarray:
     """Return the contact points in B: rim of the plate, then rims of the rotor discs, then the top, (n, 3)."""
     def ring(count: int, radius: float, centre: np.ndarray) -> np.ndarray:
@@ -63,7 +71,12 @@ def make_body(vehicle: Vehicle, disturbance: Disturbance = Disturbance()) -> Bod
     Args:
         vehicle: vehicle as its file describes it.
         disturbance: differences of the true vehicle from its file.
+
+    Raises:
+        ConfigError: a surface effect on a vehicle whose propellers have no radius.
     """
+    if disturbance.surface_effect and vehicle.propeller_radius == 0.0:
+        raise ConfigError("", "disturbance.surface_effect", f"needs the propeller_radius of {vehicle.name}, which its file does not set")
     mass = vehicle.mass * disturbance.mass_factor
     inertia = np.array(vehicle.inertia) * disturbance.inertia_factor
     points = _contact_points(vehicle)

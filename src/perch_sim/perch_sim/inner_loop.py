@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from perch_core.errors import ConfigError
 from perch_core.jit import compiled
 from perch_core.registry import resolved
 from perch_core.vehicle import Vehicle
@@ -26,11 +27,17 @@ def inner_loop(vehicle: Vehicle, lag_factor: float, voltage_factor: float = 1.0)
     """Return the inner loop between commands and rotors; None for a vehicle that takes rotor speeds.
 
     Raises:
+        ConfigError: a factor other than 1 that this vehicle does not use.
         PerchError: the vehicle's firmware is not installed, or does not start.
     """
+    firmware = bool(vehicle.actuation.firmware)
+    if voltage_factor != 1.0 and not firmware:
+        raise ConfigError("", "disturbance.voltage_factor", f"{voltage_factor:g} has no effect on {vehicle.name}, which has no firmware")
+    if lag_factor != 1.0 and (firmware or vehicle.actuation.type == "rotor_speeds"):
+        raise ConfigError("", "disturbance.loop_lag_factor", f"{lag_factor:g} has no effect on {vehicle.name}, which has no ideal inner loop")
     if vehicle.actuation.type == "rotor_speeds":
         return None
-    return resolved(FIRMWARE)(vehicle, voltage_factor) if vehicle.actuation.firmware else InnerLoop(vehicle, lag_factor)
+    return resolved(FIRMWARE)(vehicle, voltage_factor) if firmware else InnerLoop(vehicle, lag_factor)
 
 
 @compiled

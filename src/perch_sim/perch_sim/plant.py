@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.errors import ConfigError, PerchError
 from perch_core.values import Contact
 from perch_core.vehicle import Vehicle
 from perch_sim import seeding
 from perch_sim.attachment import FREE
-from perch_sim.body import PLATE_POINTS, Body, make_body
+from perch_sim.body import PLATE_POINTS, Body, hold_rate, make_body
 from perch_sim.cable_contact import CableMonitor
 from perch_sim.contact import ContactMonitor
 from perch_sim.dynamics import GRAVITY, STATES, Hold, advance_to_touch
@@ -22,6 +24,7 @@ from perch_sim.wind import WindField
 
 SUBSTEPS = 4        # Runge-Kutta steps per period: 0.5 ms each
 STEP = CONTROL_PERIOD / SUBSTEPS
+STABLE = 2.78       # greatest (rate of a decay) * (step) at which a Runge-Kutta step of fourth order decays, too
 
 
 class PlantOutput(NamedTuple):
@@ -52,8 +55,15 @@ class Plant:
             vehicle: vehicle as its file describes it.
             seed: seed of the flight, for the gusts.
             start: time of the initial state [ns].
+
+        Raises:
+            ConfigError: the board does not exist, a disturbance does not suit the vehicle, or the plate is so far from the centre of
+                mass that steps of 0.5 ms cannot follow its hold.
         """
         self.body = make_body(vehicle, scenario.disturbance)
+        if hold_rate(self.body) * STEP > STABLE:
+            raise ConfigError(f"vehicles/{vehicle.name}", "perch_offset", f"{vehicle.perch_offset:g} m is too far for {self.body.mass:g} kg with "
+                              f"inertias of {', '.join(f'{J:.3g}' for J in self.body.inertia)} kg m^2: the hold would be unstable")
         self.obstacles = make_obstacles(scenario)
         self.contact = ContactMonitor(self.body.plate_offset, self.obstacles, scenario.adhesion)
         self.cables = CableMonitor(scenario.world.cables, scenario.grip, self.body.plate_offset, np.array(vehicle.body_radii))
@@ -101,6 +111,9 @@ class Plant:
 
         Args:
             target: target speeds of the rotors (4,) [rad/s].
+
+        Raises:
+            PerchError: the state is not finite.
         """
         wind = self._wind.next()
         path, total, done, contacts = np.empty((SUBSTEPS, STATES)), np.zeros(6), 0, []
@@ -117,6 +130,8 @@ class Plant:
                 contacts += self._touches(self.time + done * CONTROL_PERIOD_NS // SUBSTEPS, before)
         states = [TrueState(self.time + (k + 1) * CONTROL_PERIOD_NS // SUBSTEPS, x) for k, x in enumerate(path)]
         self.time += CONTROL_PERIOD_NS
+        if not math.isfinite(self._x[0]):  # what is not finite reaches the position within two steps
+            raise PerchError(f"the state of the simulated vehicle is not finite {(self.time - self._start) * 1e-9:.3f} s after the start")
         elapsed = (self.time - self._start) * 1e-9
         contacts += [e._replace(stamp=self.time) for e in self.cables.update(elapsed, self._x)]
         return PlantOutput(states, total / SUBSTEPS, tuple(contacts))

@@ -60,7 +60,8 @@ class Simulation:
             drawing: renders the images of some cameras; of the others, only the frame times are simulated.
 
         Raises:
-            ConfigError: the scenario's vehicle or board does not exist, or its IMU does not run at the control rate.
+            ConfigError: the scenario's vehicle or board does not exist, its IMU does not run at the control rate, or a disturbance
+                does not suit the vehicle.
         """
         self.scenario = scenario
         self.vehicle: Vehicle = load_vehicle(scenario.vehicle)
