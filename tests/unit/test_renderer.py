@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -192,6 +193,16 @@ def test_a_hall_of_60_m_needs_no_more_memory_than_a_room():
     hall = make_scene(room_low=[-30, -20, 0], room_high=[30, 20, 15])
     assert texels(hall) <= 25.1e6
     assert texels(WALL) <= texels(hall)
+
+
+def test_large_cameras_see_what_small_ones_see():
+    """Three pixels in each direction where there was one: 43,200 cells."""
+    large = EquidistantCamera(1920, 1440, 825.0, 825.0, 961.0, 721.0, CAMERA.coefficients)
+    pose = level(-2.0, 0.0, 1.2)
+    small, fine = noiseless(WALL, FRONT, pose), noiseless(WALL, dataclasses.replace(FRONT, camera=large), pose)
+    assert fine.shape == (1440, 1920)
+    difference = cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA).astype(float) - small
+    assert np.abs(cv2.GaussianBlur(difference, (5, 5), 1.0)).mean() < 2.0
 
 
 def test_scenes_that_cannot_be_are_refused():

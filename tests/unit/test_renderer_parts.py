@@ -8,8 +8,10 @@ import pytest
 
 from perch_core.camera import EquidistantCamera, PinholeCamera
 from perch_core.camera_mount import CameraMount
+from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
-from perch_sim.rendering import textures
+from perch_sim.rendering import Scene, textures
+from perch_sim.rendering.atlas import _pack
 from perch_sim.rendering.grid import build_grid, sample_weights
 from perch_sim.rendering.renderer import spread
 from perch_sim.rendering.sensor import BASE_GAIN, READ_NOISE, SHOT_NOISE, Sensor, control_exposure
@@ -43,6 +45,20 @@ def test_samples_are_centred_in_their_pixels(ss):
     y = (weights[2] + weights[3]).mean(axis=-1) * 8 - 0.5
     np.testing.assert_allclose(x, np.broadcast_to(np.arange(8), (8, 8)), atol=1e-5)
     np.testing.assert_allclose(y, np.broadcast_to(np.arange(8)[:, None], (8, 8)), atol=1e-5)
+
+
+@pytest.mark.parametrize("room", [(500.0, 5.0, 4.0), (5.0, 500.0, 4.0), (1000.0, 1000.0, 1000.0), (0.5, 1000.0, 0.5), (10.0, 5.0, 4.0)])
+@pytest.mark.parametrize("panel", [(100.0, 100.0), (0.7, 85.0), (85.0, 0.7), (1.2, 1.2)])
+def test_textures_of_any_scene_fit_the_images_that_opencv_takes(room, panel):
+    """Sides below 32768 texels."""
+    scene = Scene(np.zeros(3), np.array(room), PerchSurface(np.ones(3), np.eye(3), panel), load_board("pad_four_tags"))
+    shapes = []
+    for face in scene.faces():
+        rows, cols = (max(8, round(2 * half / face.texel)) for half in (face.half[1], face.half[0]))
+        levels = 1 + max(0, int(np.ceil(2 * np.log2(min(rows, cols) / 4))))
+        shapes += [(max(1, round(rows * scale)), max(1, round(cols * scale))) for scale in 2.0 ** (-0.5 * np.arange(levels))]
+    places, shape = _pack(shapes)
+    assert max(shape) < 32768 and all(x + cols <= shape[1] and y + rows <= shape[0] for (x, y), (rows, cols) in zip(places, shapes))
 
 
 @pytest.mark.parametrize("contrast", [0.15, 0.3, 0.8])

@@ -16,7 +16,7 @@ from perch_sim.rendering.scene import Face, Scene
 
 BORDER = 4  # texels repeated around a texture, so that interpolation never meets the neighbour
 LEVELS_PER_OCTAVE = 2
-SHELF = 8192  # width of the atlas; OpenCV's remap takes sides below 32768
+SHELF = 8192  # width of the atlas, at least; OpenCV's remap takes sides below 32768
 VOID = 60  # grey level where no face is hit: a camera that left the room
 
 
@@ -86,8 +86,13 @@ def build_atlas(scene: Scene) -> Atlas:
 
 
 def _pack(shapes: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
-    """Return the positions (x, y) of framed tiles on shelves, tallest first, and the shape of the atlas."""
-    width = max(SHELF, max(cols for _, cols in shapes) + 2 * BORDER)
+    """Return the positions (x, y) of framed tiles on shelves, tallest first, and the shape of the atlas.
+
+    Filled in the order of height, shelves of the width W need at most the height 2 A / W + h for tiles of the area A and heights
+    up to h. All levels of a scene's faces together have up to 98e6 texels, and sides up to 16,000 (see `scene`): with W >= 2 h
+    and W >= SHELF, both sides of the atlas are below 32768.
+    """
+    width = max(SHELF, *(max(cols + 2 * BORDER, 2 * (rows + 2 * BORDER)) for rows, cols in shapes))
     places: list[tuple[int, int]] = [(0, 0)] * len(shapes)
     x = y = shelf = 0
     for index in sorted(range(len(shapes)), key=lambda i: -shapes[i][0]):

@@ -17,6 +17,7 @@ from perch_sim.rendering.visibility import FaceArrays, View, classify_view
 
 MIXED_SUPERSAMPLING = 2  # where faces meet, in each direction
 PAD_SUPERSAMPLING = 4  # of the tags, in each direction
+REMAP_SIDE = 32_000  # OpenCV's remap takes and gives images with sides below 32768: so many cells at once
 FINE_SAMPLES = 400_000  # the tags take fewer samples per pixel when they fill the image
 
 
@@ -112,6 +113,7 @@ class Rasterizer:
     def _look_up(self, image: np.ndarray, cells: np.ndarray, x: np.ndarray, y: np.ndarray,
                  supersampling: int) -> None:
         """Write the texels at x, y (cells, samples), averaged per pixel, to the image's cells."""
-        # remap requires sides below 32768, which whole cells in rows keep
-        texels = cv2.remap(self.atlas.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        place_texels(texels, cells, supersampling**2, image)
+        for begin in range(0, len(cells), REMAP_SIDE):
+            part = slice(begin, begin + REMAP_SIDE)
+            texels = cv2.remap(self.atlas.image, x[part], y[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            place_texels(texels, cells[part], supersampling**2, image)

@@ -6,7 +6,7 @@ A `Scene` is a frozen description; `Scene.faces()` decomposes it into the flat r
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from perch_core.tag_board import TagBoard
 PAD_THICKNESS = 2e-3  # the pad lies in the perching plane, the panel that carries it just behind [m]
 FLOOR_TEXEL, WALL_TEXEL, PANEL_TEXEL = 2.5e-3, 4e-3, 2.5e-3  # the floor is seen from the closest [m]
 ROOM_TEXELS = 25e6  # a large room gets coarser textures, so that memory and start stay small
+PLATE_TEXELS = 8e6  # ... and so do a large panel and a large pad
+SIDE_TEXELS = 16_000  # along the longer side of a face
 PAD_TEXELS_PER_MODULE = 32  # of a tag's 8 x 8 modules: every printed edge falls on a texel's border
 
 
@@ -108,7 +110,14 @@ class Scene:
             pad = PerchSurface(self.target.p_WS, self.target.R_WS, self.board.pad_size)
             texel = self.board.tags[0].size / self.board.modules / PAD_TEXELS_PER_MODULE
             faces.append(_surface_face(pad, "pad", texel))
-        return tuple(faces)
+        return tuple(_within_atlas(face) for face in faces)
+
+
+def _within_atlas(face: Face) -> Face:
+    """Return a face, with coarser texels where its texture would be too large for the atlas."""
+    half_u, half_v = face.half
+    texels = ROOM_TEXELS if face.kind == "room" else PLATE_TEXELS
+    return replace(face, texel=max(face.texel, 2 * max(half_u, half_v) / SIDE_TEXELS, math.sqrt(4 * half_u * half_v / texels)))
 
 
 def _surface_face(surface: PerchSurface, kind: str, texel: float) -> Face:
