@@ -44,6 +44,15 @@ def test_a_component_is_replaced_by_its_name():
     assert [e.p_WB for e in trace.values("odometry")] == [t.p_WB for t in trace.values("ground_truth/odometry")]
 
 
+@pytest.mark.parametrize("given, rendered", [("all", {"down", "front"}), ("down", {"down"}), ("none", set())])
+def test_a_scenarios_parameters_of_the_vehicle_are_those_of_its_node(given, rendered):
+    scenario = replace(load_scenario("surface_90"), parameters={"vehicle": {"cameras": given}})
+    loop = arrange(scenario, 1, Sensing("rendered", "rendered"), without=("vio", "target_localizer", "mission", "perching_planner"))
+    arrivals = [arrival for _ in range(60) for arrival in loop.vehicle.advance()]
+    loop.close()
+    assert {arrival.camera for arrival in arrivals if arrival.image is not None} == rendered
+
+
 def test_another_seed_is_another_flight(flown):
     """That the same seed is the same flight is shown in `test_goals_in_a_row.py`, and across processes in `tests/system`."""
     other = arrange(load_scenario("surface_90"), 3)

@@ -88,6 +88,7 @@ def test_surface_faces_the_start():
     ({"target": {"inclination_deg": 180.0, "height": 0.5}}, "below the search hover"),
     ({"nodes": ["vehicle", "pilot"]}, "'pilot' is not one of"),
     ({"parameters": {"pilot": {}}}, "parameters.pilot"),
+    ({"parameters": {"vehicle": {"vehicle": "rpg"}}}, "parameters.vehicle.vehicle: follows from the scenario"),
     ({"targett": {}}, "unknown key"),
     ({"mode": "powerline"}, "world.cables: has 0 entries, outside [1, 100]"),
     ({"world": {"cables": [{"start": [1.0, 0.0, 2.0], "end": [1.0, 0.0, 2.0]}]}}, "world.cables[0]: cable: both ends"),

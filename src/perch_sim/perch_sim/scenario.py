@@ -33,6 +33,8 @@ NODES = {
     "viewer": "perch_eval",
 }
 """Node, also the name of its executable -> package."""
+OF_THE_FLIGHT = ("scenario", "vehicle", "seed", "participants")
+"""Parameters of the node `vehicle` that follow from the scenario as a whole, the flight's seed and its nodes."""
 MAX_CABLES = 100
 
 
@@ -199,6 +201,9 @@ class Scenario:
         for node in self.parameters or {}:
             if node not in NODES:
                 raise ConfigError("", f"parameters.{node}", f"is not one of {', '.join(NODES)}")
+        for name in (self.parameters or {}).get("vehicle", {}):
+            if name in OF_THE_FLIGHT:
+                raise ConfigError("", f"parameters.vehicle.{name}", "follows from the scenario itself, the flight's seed and its nodes")
         x, y, z = self.start.position
         if self._outside(np.array(self.start.position)) or z != 0.0:
             raise ConfigError("", "start.position", f"({x:g}, {y:g}, {z:g}) m is not on the floor of the room")

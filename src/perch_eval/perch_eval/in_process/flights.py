@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from dataclasses import replace as replaced
 from typing import Any
 
 from perch_core.component import Component
@@ -20,7 +21,7 @@ from perch_eval.in_process.trace import FlightTrace
 from perch_perception.target_localizer import TargetLocalizerConfig
 from perch_sim.drawing import OnDemandRendering
 from perch_sim.lockstep import Task, flight_tasks
-from perch_sim.parameters import VehicleParameters
+from perch_sim.parameters import CAMERAS, VehicleParameters
 from perch_sim.scenario import Scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
 
@@ -65,8 +66,10 @@ def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, repl
     names = [name for name in ("vio" if sensing.vio == "rendered" else "vio_model", "estimator", localizer, "controller", "mission")
              if name not in left_out]
     front = "target_localizer" in names or sensing.target == "rendered"  # its frames start work, whether or not they are drawn
-    cameras = {(True, True): "all", (True, False): "down", (False, True): "front", (False, False): "none"}[sensing.vio == "rendered", front]
-    vehicle = SimulatedVehicle(VehicleParameters(seed=seed, cameras=cameras), scenario, OnDemandRendering)
+    given = parameters.node_config("vehicle", VehicleParameters)
+    rendered = {camera for camera, wanted in (("down", sensing.vio == "rendered"), ("front", front)) if wanted} & set(CAMERAS[given.cameras])
+    cameras = next(name for name, members in CAMERAS.items() if set(members) == rendered)
+    vehicle = SimulatedVehicle(replaced(given, cameras=cameras), scenario, OnDemandRendering)
     components = {}
     for name in names:
         if name in replace:
