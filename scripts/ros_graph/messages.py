@@ -116,6 +116,9 @@ def _scalar(type_name: str, value: Any) -> Any:
         return bytes([value])
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError
+    limits = np.iinfo(type_name)
+    if not limits.min <= value <= limits.max:  # rclpy would keep the low bytes
+        raise ValueError
     return value
 
 

@@ -130,7 +130,8 @@ def _subscribe(graph: GraphConnection, arguments: argparse.Namespace, callback: 
     """Subscribe to the topic of the command line with QoS compatible with its publishers; its type is given or from the graph."""
     cls = interface(arguments.type or topic_type(graph, arguments.topic, arguments.spin_time), "msg")
     topic = graph.absolute(arguments.topic)
-    profiles = [endpoint.qos_profile for endpoint in graph.node.get_publishers_info_by_topic(topic)]
+    publishers = graph.spin_until(lambda: graph.node.get_publishers_info_by_topic(topic), arguments.spin_time)
+    profiles = [endpoint.qos_profile for endpoint in publishers]
     profile = QoSProfile(depth=10)
     if any(p.reliability == ReliabilityPolicy.BEST_EFFORT for p in profiles):
         profile.reliability = ReliabilityPolicy.BEST_EFFORT

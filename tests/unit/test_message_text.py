@@ -11,7 +11,7 @@ from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from perch_core.errors import ConfigError
-from perch_msgs.msg import MotorCommand, Trajectory
+from perch_msgs.msg import ControllerCommand, MotorCommand, Trajectory
 from ros_graph.commands import GraphError
 from ros_graph.messages import fill, interface, parse, pick, to_yaml
 from ros_graph.topics import rate_summary
@@ -74,6 +74,13 @@ def test_fixed_arrays_need_their_length():
         fill(MotorCommand(), {"rotor_speed": [1, 2, 3]})
     with pytest.raises(GraphError, match="does not fit"):
         fill(MotorCommand(), {"armed": 1})
+
+
+@pytest.mark.parametrize("value", [-1, 256, 258, 1 << 70, -(1 << 70)])
+def test_integers_beyond_their_type_are_refused(value):
+    with pytest.raises(GraphError, match="does not fit uint8"):
+        fill(ControllerCommand(), {"command": value})
+    assert fill(ControllerCommand(), {"command": 5}).command == 5
 
 
 def test_numbers_that_yaml_takes_for_text_are_numbers():

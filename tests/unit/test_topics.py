@@ -9,6 +9,7 @@ from perch_core.component import Action, Client, Component, Input, Output, Servi
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.goal_server import ServedGoal
+from perch_core.ros.intake import Intake
 from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust
 from perch_msgs.action import Perch
 from perch_sim.scenario import NODES
@@ -48,6 +49,16 @@ def test_fast_messages_are_those_of_rclpy(channel, value):
     assert deserialize_message(row.pack(value), row.message) == deserialize_message(by_rclpy, row.message)
     assert same(row.unpack(by_rclpy), row.to_value(deserialize_message(by_rclpy, row.message)))
     assert same(topics.decode(channel, topics.encode(channel, value)), value)
+
+
+@pytest.mark.parametrize("row", topics.TOPICS, ids=lambda row: row.channel)
+def test_bytes_that_are_no_message_are_refused(row):
+    for data in (b"", b"\0\1\0\0", b"\0\1\0\0\1\0"):
+        with pytest.raises(PerchError):
+            row.read(data)
+        if "header" in row.message.get_fields_and_field_types():
+            with pytest.raises(PerchError, match="not a whole"):
+                topics.stamp_of(row.message, data)
 
 
 @pytest.mark.parametrize("channel, value", FAST)
@@ -103,3 +114,12 @@ def test_a_goal_that_is_rejected_has_not_perched():
     handle = SimpleNamespace(request=Perch.Goal(), abort=lambda: ends.append("aborted"))
     ServedGoal(SimpleNamespace(finish=lambda handle, result: results.append(result)), handle, topics.action("perch")).reject("busy")
     assert ends == ["aborted"] and (results[0].success, results[0].error_code, results[0].message) == (False, Perch.Result.BAD_GOAL, "busy")
+
+
+def test_an_observer_refuses_bytes_that_are_no_message_and_goes_on():
+    refused, seen = [], []
+    intake = Intake(SimpleNamespace(wiring=None, log_refusal=lambda channel, error: refused.append((channel, error))))
+    row = topics.topic("odometry")
+    for data in (b"\0\1\0\0", topics.encode("odometry", _odometry())):
+        intake._receive_raw(row, "odometry", "/odometry", seen.append, data)
+    assert [value.stamp for value in seen] == [5_000_000_123] and [channel for channel, _ in refused] == ["odometry"]

@@ -51,7 +51,7 @@ class Intake:
         if port.value is not Serialized:
             self._subscribe(port, row, _Reader(node, channel, row, handler), row.qos.subscribe)
             return
-        receive = partial(self._receive_raw, row, resolved, handler)
+        receive = partial(self._receive_raw, row, channel, resolved, handler)
         subscription = self._subscribe(port, row, receive, qos.recording_profile(row.qos))
         if row.qos.subscribe.reliability is ReliabilityPolicy.BEST_EFFORT:
             if not self._raw_best_effort:
@@ -98,9 +98,13 @@ class Intake:
             self._wiring.enter(self.take_lazy)
         self._wiring.enter(work, argument)
 
-    @staticmethod
-    def _receive_raw(row: topics.Topic, topic: str, handler: Callable[[Any], None], data: bytes) -> None:
-        handler(Serialized(topic, topics.stamp_of(row.message, data), data, row.message))
+    def _receive_raw(self, row: topics.Topic, channel: str, topic: str, handler: Callable[[Any], None], data: bytes) -> None:
+        try:
+            value = Serialized(topic, topics.stamp_of(row.message, data), data, row.message)
+        except PerchError as error:
+            self._node.log_refusal(channel, error)
+            return
+        handler(value)
 
 
 class _Reader:

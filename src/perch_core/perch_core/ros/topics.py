@@ -28,6 +28,7 @@ from perch_msgs.msg import (
     AttitudeThrust, Contact, ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, PowerlineArray, RatesThrust,
     RotorState, TargetDetection, Trajectory, VioState)
 from perch_msgs.srv import PlanPerch, PlanPowerline, SetController
+from rclpy._rclpy_pybind11 import RMWError
 from rclpy.qos import DurabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
@@ -75,7 +76,13 @@ class Topic:
         """
         if len(data) > self.size_max:
             raise PerchError(f"{len(data)} bytes are more than {self.size_max}")
-        return self.unpack(data) if self.unpack is not None else self.to_value(deserialize_message(data, self.message))
+        if self.unpack is not None:
+            return self.unpack(data)
+        try:
+            message = deserialize_message(data, self.message)
+        except RMWError as error:
+            raise PerchError(f"not a whole {self.message.__name__}: {error}") from None
+        return self.to_value(message)
 
     @property
     def latched(self) -> bool:
@@ -230,8 +237,14 @@ _BEGIN = struct.Struct("<iI")  # of a stamp, after four bytes of encapsulation
 
 
 def stamp_of(message: Any, data: bytes) -> int:
-    """Return the stamp of a serialised message that begins with a header or is a clock [ns]; 0 for other messages."""
+    """Return the stamp of a serialised message that begins with a header or is a clock [ns]; 0 for other messages.
+
+    Raises:
+        PerchError: the message ends before its stamp.
+    """
     if message is Clock or "header" in message.get_fields_and_field_types():
+        if len(data) < 4 + _BEGIN.size:
+            raise PerchError(f"not a whole {message.__name__}: {len(data)} bytes")
         sec, nanosec = _BEGIN.unpack_from(data, 4)
         return int(sec * NANOSECONDS + nanosec)
     return 0

@@ -57,9 +57,12 @@ class GraphListener(GraphNode):
         del values[:-MAX_VALUES]
 
     def _on_image(self, row: topics.Topic, data: bytes) -> None:
-        image = row.read(data)
         assert self.turns is not None
-        self.turns.add(image.stamp, image.pixels())
+        try:
+            image = row.read(data)
+            self.turns.add(image.stamp, image.pixels())
+        except PerchError:
+            return
 
     def await_first(self, channel: str, timeout: float) -> None:
         """Wait for the first value of a channel, as discovery takes time; at most for `patience` [s]."""
