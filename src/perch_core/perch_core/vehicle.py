@@ -28,15 +28,15 @@ class CameraConfig:
     width: int = quantity(unit="px", low=16, high=4096)
     height: int = quantity(unit="px", low=16, high=4096)
     focal: tuple[float, float] = quantity(unit="px", above=0.0, doc="fx, fy")
-    centre: tuple[float, float] = quantity(unit="px", low=0.0, doc="cx, cy")
+    centre: tuple[float, float] = quantity(unit="px", low=0.0, doc="cx, cy; within the image")
     distortion: Vector4 = quantity((0.0, 0.0, 0.0, 0.0), low=-10.0, high=10.0, doc="k1..k4 of the Kannala-Brandt polynomial")
     position: Vector3 = quantity(unit="m", low=-5.0, high=5.0, doc="p_BC")
     orientation: Quaternion = quantity(low=-1.01, high=1.01, doc="q_BC, xyzw")
     colour: bool = quantity(False, doc="rgb8 instead of mono8")
     rate: float = quantity(30.0, unit="Hz", above=0.0, high=120.0)
-    exposure: float = quantity(0.0035, unit="s", above=0.0, high=0.03)
-    exposure_max: float = quantity(0.0097, unit="s", above=0.0, high=0.03)
-    readout: float = quantity(0.0093, unit="s", low=0.0, high=0.05)
+    exposure: float = quantity(0.0035, unit="s", above=0.0, high=0.03, doc="under light 1")
+    exposure_max: float = quantity(0.0097, unit="s", above=0.0, high=0.03, doc="in the dark; at most the period of the frames")
+    readout: float = quantity(0.0093, unit="s", low=0.0, high=0.05, doc="of a frame; at most the period of the frames")
     transport_min: float = quantity(0.005, unit="s", low=0.0, high=0.2)
     transport_max: float = quantity(0.010, unit="s", low=0.0, high=0.2)
     stamp_offset: float = quantity(0.0, unit="s", low=-0.05, high=0.05, doc="stamp minus true mid-exposure time")
@@ -47,6 +47,13 @@ class CameraConfig:
             raise ConfigError("", "distortion", f"{list(self.distortion)} is of the model equidistant: a pinhole has none")
         if self.transport_max < self.transport_min:
             raise ConfigError("", "transport_max", f"{self.transport_max:g} is below transport_min {self.transport_min:g}")
+        if self.centre[0] > self.width or self.centre[1] > self.height:
+            raise ConfigError("", "centre", f"{list(self.centre)} px is outside the image, [0, {self.width}] x [0, {self.height}] px")
+        if self.exposure > self.exposure_max:
+            raise ConfigError("", "exposure", f"{self.exposure:g} s is above exposure_max {self.exposure_max:g} s")
+        for key, value in (("exposure_max", self.exposure_max), ("readout", self.readout)):
+            if value * self.rate > 1.0:
+                raise ConfigError("", key, f"{value:g} s is outside [0, {1.0 / self.rate:.4g}] s, the period of frames at {self.rate:g} Hz")
 
     def mount(self, name: str) -> CameraMount:
         """Return the camera with its pose on the body."""
