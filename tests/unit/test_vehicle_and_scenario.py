@@ -60,6 +60,20 @@ def test_a_vehicle_that_no_vehicle_can_be_is_refused(change, words):
     assert words in str(error.value)
 
 
+@pytest.mark.parametrize("change, words", [
+    ({"centre": [641.0, 240.0]}, "cameras.down.centre: [641.0, 240.0] px is outside the image, [0, 640] x [0, 480] px"),
+    ({"exposure": 0.02}, "cameras.down.exposure: 0.02 s is above exposure_max 0.0097 s"),
+    ({"rate": 100.0, "exposure_max": 0.02}, "cameras.down.exposure_max: 0.02 s is outside [0, 0.01] s, the period of frames at 100 Hz"),
+    ({"rate": 100.0, "readout": 0.02}, "cameras.down.readout: 0.02 s is outside [0, 0.01] s"),
+])
+def test_a_camera_that_no_camera_can_be_is_refused(change, words):
+    content = config.read_yaml(config.find("vehicles", "snapdragon"))
+    cameras = content["cameras"] | {"down": content["cameras"]["down"] | change}
+    with pytest.raises(ConfigError) as error:
+        config.from_mapping(Vehicle, content | {"cameras": cameras}, "x.yaml")
+    assert words in str(error.value)
+
+
 @pytest.mark.parametrize("name", sorted(p.stem for p in (config.config_dir() / "scenarios").glob("*.yaml")))
 def test_every_scenario_loads_with_its_vehicle_and_board(name):
     scenario = load_scenario(name)
@@ -122,6 +136,15 @@ def test_a_scenario_takes_over_what_it_does_not_say_itself(tmp_path):
     assert mine.parameters["powerline_planner"] == {**base.parameters["powerline_planner"], "deadline": 12.0}
     assert mine.parameters["controller"] == base.parameters["controller"]
     assert "extends" not in extended_mapping("scenarios", tmp_path / "theirs.yaml")
+
+
+@pytest.mark.parametrize("base, own", [("nmpc.horizon: 0.4", "nmpc: {horizon: 0.6}"), ("nmpc: {horizon: 0.4}", "nmpc.horizon: 0.6")])
+def test_a_parameter_replaces_that_of_the_base_however_either_is_written(tmp_path, base, own):
+    write(tmp_path, first=f"extends: surface_90\nname: first\nparameters: {{controller: {{{base}}}}}\n",
+          second=f"extends: first.yaml\nname: second\nparameters: {{controller: {{{own}}}}}\n",
+          third=f"extends: second.yaml\nname: third\nparameters: {{controller: {{{base.replace('0.4', '0.8')}}}}}\n")
+    for name, value in (("first", 0.4), ("second", 0.6), ("third", 0.8)):
+        assert config.nested(load_scenario(tmp_path / f"{name}.yaml").parameters["controller"]) == {"nmpc": {"horizon": value}}
 
 
 @pytest.mark.parametrize("start, words", [

@@ -10,11 +10,14 @@ from perch_core import config
 from perch_core.errors import ConfigError
 
 EXTENDS = "extends"
+PARAMETERS = "parameters"  # of nodes, in scenarios
 CHAIN_MAX = 10
 
 
 def extended_mapping(kind: str, name_or_path: str | Path) -> dict[str, Any]:
     """Return the content of a file merged over all files that it extends: mappings key by key, other values replaced.
+
+    Parameters of nodes have dotted names, whichever way the files write them.
 
     Args:
         kind: folder in `config`.
@@ -36,6 +39,9 @@ def _load_merged(kind: str, path: Path, chain: tuple[Path, ...]) -> dict[str, An
     content = config.read_yaml(path) or {}
     if not isinstance(content, dict):
         raise ConfigError(source, "", f"{content!r} is not a mapping")
+    if isinstance(content.get(PARAMETERS), dict):  # dotted or nested: one spelling, so that a file's values replace those of its base
+        content[PARAMETERS] = {node: config.flattened(values) if isinstance(values, dict) else values
+                               for node, values in content[PARAMETERS].items()}
     if EXTENDS not in content:
         return content
     base = content.pop(EXTENDS)
