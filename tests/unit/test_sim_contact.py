@@ -184,6 +184,11 @@ def test_a_moving_pad_carries_the_vehicle_away():
     np.testing.assert_allclose(plant.state.p_WB[1], 0.3, atol=0.01)
 
 
+def test_a_panel_smaller_than_its_pad_is_refused():
+    with pytest.raises(ConfigError, match="target.panel_size: .* m is below the pad's .0.6, 0.6. m"):
+        plant_of(dataclasses.replace(SCENARIO, target=Target(panel_size=(1.0, 0.5))))
+
+
 def test_a_plate_is_held_at_rest_or_refused_but_never_shaken():
     """The longer the arm, the stiffer the hold for steps of 0.5 ms."""
     scenario = dataclasses.replace(SCENARIO, disturbance=Disturbance(inertia_factor=0.3))

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
 from perch_sim.scenario import Scenario
@@ -48,7 +49,11 @@ def pad_surface(scenario: Scenario, time: float) -> PerchSurface:
 
 
 def make_obstacles(scenario: Scenario) -> Obstacles:
-    """Return floor, ceiling and walls of the room, and in surface scenarios the panel with its pad."""
+    """Return floor, ceiling and walls of the room, and in surface scenarios the panel with its pad.
+
+    Raises:
+        ConfigError: the board does not exist, or its pad is larger than the panel.
+    """
     length, width, height = scenario.world.room
     cx, cy = scenario.world.room_centre
     planes = [("floor", (cx, cy, 0.0), (0, 0, 1)), ("ceiling", (cx, cy, height), (0, 0, -1)),
@@ -63,6 +68,8 @@ def make_obstacles(scenario: Scenario) -> Obstacles:
     if scenario.mode == "surface":
         surface = scenario.surface
         pad, pad_half = len(names), np.array(load_board(scenario.target.board).pad_size) / 2
+        if np.any(np.array(scenario.target.panel_size) / 2 < pad_half):
+            raise ConfigError("", "target.panel_size", f"{list(scenario.target.panel_size)} m is below the pad's {(2 * pad_half).tolist()} m")
         names.append("pad")
         origin.append(surface.p_WS)
         axes.append(surface.R_WS)

@@ -56,7 +56,7 @@ class Target:
     bearing_deg: float = quantity(0.0, unit="deg", low=-60.0, high=60.0, doc="of the pad from the start, from the start's yaw")
     turn_deg: float = quantity(0.0, unit="deg", low=-60.0, high=60.0, doc="turn of the surface about the vertical")
     board: str = text("pad_four_tags", doc="tag board, config/boards/<name>.yaml")
-    panel_size: tuple[float, float] = quantity((1.2, 1.2), unit="m", above=0.0, high=100.0, doc="the surface around the pad")
+    panel_size: tuple[float, float] = quantity((1.2, 1.2), unit="m", above=0.0, high=100.0, doc="the surface around the pad, at least as large")
     velocity: Vector3 = quantity((0.0, 0.0, 0.0), unit="m/s", low=-20.0, high=20.0, doc="of the moving pad in map")
 
 
