@@ -122,6 +122,18 @@ def test_frames_arrive_with_their_model_and_an_image_that_is_drawn_when_it_is_lo
     assert all(0 < flown.time - a.middle for a in front) and all(abs(a.stamp - a.middle) < 20 * MS for a in front)
 
 
+def test_each_reader_of_an_image_gets_the_region_that_it_asks_for():
+    flown, seen = vehicle("front")
+    while not seen["image_front"]:
+        flown.advance()
+    image, first, inner = seen["image_front"][0], (slice(100, 200), slice(200, 300)), (slice(120, 180), slice(210, 290))
+    part = image.pixels(first)
+    assert image.pixels(inner) is part and not part[300:].any()
+    whole = image.pixels((slice(0, 400), slice(0, 300)))
+    assert np.array_equal(whole[first], part[first]) and min(whole.mean(axis=0).min(), whole.mean(axis=1).min()) > 10.0
+    assert image.pixels() is whole
+
+
 @pytest.mark.slow
 def test_images_that_processes_draw_are_waited_for_and_a_camera_whose_process_ends_goes_on_without():
     expected, on_demand = vehicle("front")

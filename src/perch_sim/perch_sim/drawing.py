@@ -44,7 +44,7 @@ class PendingImage(Protocol):
         """Return the image, uint8, as `Renderer.render`; None if the process that renders it has ended.
 
         Args:
-            region: rows and columns that the first caller needs; the rest need not be rendered. None: all of it.
+            region: rows and columns that the caller needs; the rest need not be rendered. None: all of it.
         """
 
 
@@ -107,14 +107,21 @@ class _LazyImage:
     def __init__(self, render: Callable[..., np.ndarray]) -> None:
         self._render = render
         self._image: np.ndarray | None = None
+        self._region: Region | None = None  # that is rendered; None: all of it
 
     def done(self, timeout: float = 0.0) -> bool:
         return self._image is not None
 
     def result(self, region: Region | None = None) -> np.ndarray:
         if self._image is None:
-            self._image = self._render(region=region)
+            self._image, self._region = self._render(region=region), region
+        elif self._region is not None and not _within(region, self._region):
+            self._image, self._region = self._render(region=None), None
         return self._image
+
+
+def _within(part: Region | None, whole: Region) -> bool:
+    return part is not None and all(w.start <= p.start and p.stop <= w.stop for p, w in zip(part, whole))
 
 
 class ProcessRendering:
