@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from perch_core.component import Action, Client, Component, Service, Timer  # noqa: E402
+from perch_core.component import Action, Client, Component, Service, Timer, Unavailable  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
 from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult  # noqa: E402
@@ -34,7 +34,7 @@ class Asking(Component[Nothing]):
 
     def on_plan_perch(self, answer) -> None:
         """Keep it."""
-        self.answers.append(answer.message)
+        self.answers.append(answer.reason if isinstance(answer, Unavailable) else answer.message)
 
 
 class Serving(Component[Nothing]):
@@ -91,6 +91,21 @@ def test_each_of_two_open_requests_gets_its_own_answer(executor):
     asking.participant.begin(1, [])
     until(executor, lambda: results.append(asking.participant.results()) or results[-1] is not None)
     assert asking.component.answers == ["first", "second"]
+
+
+def test_an_answer_that_comes_after_its_request_was_dropped_is_not_that_of_the_next_one(executor, monkeypatch):
+    asking, replies, results = participant(executor, Asking), created(executor, ArrivalNode, Serving).component.replies, []
+    asking.component.plan_perch(REQUEST, 0)
+    until(executor, lambda: len(replies) == 1)
+    monkeypatch.setattr("perch_sim.ros.participant_node.ANSWER_TIMEOUT", -1.0)
+    asking._expire_requests()
+    asking.component.plan_perch(REQUEST, 0)
+    until(executor, lambda: len(replies) == 2)
+    for reply, message in zip(replies, ("late", "second")):
+        reply(PerchPlan(success=False, error_code=2, message=message))
+    asking.participant.begin(1, [])
+    until(executor, lambda: results.append(asking.participant.results()) or results[-1] is not None)
+    assert len(asking.component.answers) == 2 and "has not answered" in asking.component.answers[0] and asking.component.answers[1] == "second"
 
 
 class Failing(Component[Nothing]):

@@ -10,12 +10,12 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from perch_core.component import Action, Client, Component, Input, Service, Timer, ports
+from perch_core.component import Action, Component, Input, Service, Timer, ports
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.deadlines import Deadlines
 from perch_core.ros.intake import Intake
 from perch_core.ros.priority import priority
-from perch_core.ros.service_clients import connect_clients
+from perch_core.ros.service_clients import Send, connect_clients
 from perch_core.ros.wiring import Wiring, foreign_publishers
 from rclpy.clock import Clock, ClockType
 
@@ -45,7 +45,8 @@ class ArrivalNode(ComponentNode):
             self._intake.add(port)
         for timer in ports(type(self.component), Timer):
             self._create_component_timer(timer)
-        connect_clients(self, self.component, self._deliver_answer)
+        for name, send in connect_clients(self, self.component).items():
+            setattr(self.component, name, partial(self._send_request, name, send))
         self.serve()
         if self._intake.private:
             self.create_timer(CHECK_PERIOD, self._warn_foreign_publishers, clock=self._steady)
@@ -67,8 +68,9 @@ class ArrivalNode(ComponentNode):
         """Call `work` at once."""
         self.wiring.enter(self.guarded, port.name, work, *arguments)
 
-    def _deliver_answer(self, port: Client[Any, Any], answer: Any) -> None:
-        self.wiring.enter(self.guarded, port.name, port.handler(self.component), answer)
+    def _send_request(self, name: str, send: Send, request: Any, due: int) -> None:
+        """Send a component's request; `due` has a meaning in lockstep only."""
+        send(request, partial(self.wiring.enter, self.guarded, name, getattr(self.component, f"on_{name}")))
 
     # -- diagnostics and priority --------------------------------------------------------------------------------------
 

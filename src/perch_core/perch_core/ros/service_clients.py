@@ -16,16 +16,22 @@ DISCOVERY_TIMEOUT = 5.0  # a request fails after so long without a server; a nod
 CHECK_PERIOD = 0.1       # of the check for servers while a request is open [s]
 WATCH_PERIOD = 1.0       # of the check for new servers [s]
 
-Deliver = Callable[[Client[Any, Any], Any], None]
+Send = Callable[[Any, Callable[[Any], None]], None]
 
 
-def connect_clients(node: Node, component: Component[Any], deliver: Deliver) -> None:
-    """Create the clients of a component; `deliver(port, answer)` takes each answer on the executor's thread."""
+def connect_clients(node: Node, component: Component[Any]) -> dict[str, Send]:
+    """Create the clients of a component.
+
+    Returns:
+        Name of the port -> function (request, take) that sends a request; `take(answer)` is called on the executor's thread.
+    """
+    functions: dict[str, Send] = {}
     for port in ports(type(component), Client):
         row = topics.service(port.channel(component))
         client = node.create_client(row.type, port.channel(component))
-        setattr(component, port.name, _client_function(node, port, row, client, deliver))
+        functions[port.name] = _client_function(node, row, client)
         _watch_servers(node, component, client)
+    return functions
 
 
 def _servers(node: Node, client: Any) -> set[bytes]:
@@ -47,9 +53,9 @@ def _watch_servers(node: Node, component: Component[Any], client: Any) -> None:
     node.create_timer(WATCH_PERIOD, check, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def _client_function(node: Node, port: Client[Any, Any], row: topics.ServiceRow, client: Any, deliver: Deliver) -> Callable[[Any, int], None]:
+def _client_function(node: Node, row: topics.ServiceRow, client: Any) -> Send:
     """Return a function that sends a request to every server that appears until one has answered: a server may be restarted."""
-    def send_request(request: Any, due: int) -> None:
+    def send_request(request: Any, take: Callable[[Any], None]) -> None:
         message, requested, calls = row.request_message(request), set[bytes](), list[Any]()
         unanswered, last_available = True, time.monotonic()
 
@@ -60,7 +66,7 @@ def _client_function(node: Node, port: Client[Any, Any], row: topics.ServiceRow,
                 node.destroy_timer(timer)
                 for call in calls:
                     client.remove_pending_request(call)
-                deliver(port, answer)
+                take(answer)
 
         def check() -> None:
             nonlocal last_available

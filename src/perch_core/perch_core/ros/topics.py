@@ -28,7 +28,7 @@ from perch_msgs.msg import (
     AttitudeThrust, Contact, ControllerCommand, ControllerStatus, ControlReference, EstimatorStatus, MotorCommand, PowerlineArray, RatesThrust,
     RotorState, TargetDetection, Trajectory, VioState)
 from perch_msgs.srv import PlanPerch, PlanPowerline, SetController
-from rclpy._rclpy_pybind11 import RMWError
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
@@ -80,7 +80,7 @@ class Topic:
             return self.unpack(data)
         try:
             message = deserialize_message(data, self.message)
-        except RMWError as error:
+        except rclpy_implementation.RMWError as error:
             raise PerchError(f"not a whole {self.message.__name__}: {error}") from None
         return self.to_value(message)
 

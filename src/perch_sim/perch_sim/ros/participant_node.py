@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections import defaultdict, deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 from perch_core.component import Action, Client, Component, Input, Service, Unavailable, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
-from perch_core.ros.service_clients import connect_clients
+from perch_core.ros.service_clients import Send, connect_clients
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import Intake
 from perch_core.ros.priority import priority
@@ -53,9 +52,9 @@ class ParticipantNode(ComponentNode):
         self._observed = [port for port in ports(component, Input) if port.channel(self.component) in OBSERVED and port.value is Serialized]
         self.participant.inputs -= {port.channel(self.component) for port in self._observed}
         self._intake = Intake(self)
-        self._request_senders: dict[str, Callable[[Any, int], None]] = {}
-        self._open_requests: defaultdict[str, deque[tuple[Answer, float]]] = defaultdict(deque)
-        """Channel -> unanswered requests, each with its time on the monotonic clock [s]; a server answers them in order."""
+        self._request_senders: dict[str, Send] = {}
+        self._open_requests: list[tuple[str, Answer, float]] = []
+        """Requests without an answer: channel, answer, and time on the monotonic clock [s]."""
         self._busy = False  # processing a batch
         self._vehicle: Any = None  # the connection to it, if any
         self._connection_poll = ConnectionPoll()
@@ -64,11 +63,8 @@ class ParticipantNode(ComponentNode):
 
     def connect(self) -> None:
         """Offer services and connect clients; if the vehicle is in another process, connect to it."""
-        senders = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
-        connect_clients(self, self.component, self._deliver_answer)
-        self._request_senders = {port.channel(self.component): getattr(self.component, port.name) for port in self._client_ports()}
-        for port in self._client_ports():  # those of the participant, which deliver answers when they are due
-            setattr(self.component, port.name, senders[port.channel(self.component)])
+        senders = connect_clients(self, self.component)
+        self._request_senders = {port.channel(self.component): senders[port.name] for port in ports(type(self.component), Client)}
         self.serve()
         for observed in self._observed:
             self._intake.add(observed)
@@ -156,29 +152,24 @@ class ParticipantNode(ComponentNode):
         self.participant.enter(port.name, partial(self.guarded, port.name, work, *arguments))
         self._progress()
 
-    def _client_ports(self) -> list[Client]:
-        return list(ports(type(self.component), Client))
-
     def _send_request(self, channel: str, request: Any) -> Answer:
         """Send a component's request to its service; the participant delivers the answer when it is due."""
         answer = Answer()
-        self._open_requests[channel].append((answer, time.monotonic()))
-        self._request_senders[channel](request, 0)
+        self._open_requests.append((channel, answer, time.monotonic()))
+        self._request_senders[channel](request, partial(self._take_answer, answer))
         return answer
 
-    def _deliver_answer(self, port: Client, value: Any) -> None:
-        waiting = self._open_requests[port.channel(self.component)]
-        if waiting:
-            waiting.popleft()[0](value)
+    def _take_answer(self, answer: Answer, value: Any) -> None:
+        answer(value)
         self._progress()
 
     def _expire_requests(self) -> None:
         """Answer overdue requests with `Unavailable`: their servers may have ended, and the flight must not wait for ever."""
-        for channel, waiting in tuple(self._open_requests.items()):
-            if waiting and time.monotonic() - waiting[0][1] > ANSWER_TIMEOUT:
+        self._open_requests = [request for request in self._open_requests if not request[1].done()]
+        for channel, answer, since in self._open_requests:
+            if time.monotonic() - since > ANSWER_TIMEOUT:
                 self.get_logger().error(f"{channel} has not answered for {ANSWER_TIMEOUT:g} s: the request is dropped")
-                waiting.popleft()[0](Unavailable(f"{channel} has not answered within {ANSWER_TIMEOUT:g} s"))
-                self._progress()
+                self._take_answer(answer, Unavailable(f"{channel} has not answered within {ANSWER_TIMEOUT:g} s"))
 
     def _progress(self) -> None:
         """Continue the present batch, as something for which it waits may have arrived."""
