@@ -122,6 +122,7 @@ def test_frames_arrive_with_their_model_and_an_image_that_is_drawn_when_it_is_lo
     assert all(0 < flown.time - a.middle for a in front) and all(abs(a.stamp - a.middle) < 20 * MS for a in front)
 
 
+@pytest.mark.slow
 def test_each_reader_of_an_image_gets_the_region_that_it_asks_for():
     flown, seen = vehicle("front")
     while not seen["image_front"]:

@@ -71,26 +71,30 @@ def _add_force(R: np.ndarray, r: np.ndarray, f_W: np.ndarray, force_W: np.ndarra
 
 @compiled
 def _depth(s: int, point_W: np.ndarray, surfaces: Surfaces, time: float) -> float:
-    """Return the signed distance of a point from surface `s` [m]; NO_CONTACT beside its rectangle or behind it."""
+    """Return the signed distance of a point from surface `s` [m]; NO_CONTACT beside its rectangle or behind it.
+
+    A point behind the rectangle is beside it where it is nearer to the border: another face of the same box is then nearest.
+    """
     d0 = point_W[0] - surfaces.origin[s, 0] - surfaces.velocity[s, 0] * time
     d1 = point_W[1] - surfaces.origin[s, 1] - surfaces.velocity[s, 1] * time
     d2 = point_W[2] - surfaces.origin[s, 2] - surfaces.velocity[s, 2] * time
     A = surfaces.axes[s]
-    if abs(d0 * A[0, 0] + d1 * A[1, 0] + d2 * A[2, 0]) > surfaces.half_size[s, 0]:
-        return NO_CONTACT
-    if abs(d0 * A[0, 1] + d1 * A[1, 1] + d2 * A[2, 1]) > surfaces.half_size[s, 1]:
-        return NO_CONTACT
     z = d0 * A[0, 2] + d1 * A[1, 2] + d2 * A[2, 2]
+    inside = min(z, 0.0)
+    if abs(d0 * A[0, 0] + d1 * A[1, 0] + d2 * A[2, 0]) > surfaces.half_size[s, 0] + inside:
+        return NO_CONTACT
+    if abs(d0 * A[0, 1] + d1 * A[1, 1] + d2 * A[2, 1]) > surfaces.half_size[s, 1] + inside:
+        return NO_CONTACT
     return z if z > -surfaces.depth[s] else NO_CONTACT
 
 
 @compiled
 def _near(s: int, x: np.ndarray, surfaces: Surfaces, time: float, reach: float) -> bool:
-    """Return whether a point within `reach` of the centre of mass can be below surface `s`."""
+    """Return whether a point within `reach` of the centre of mass can be inside surface `s`."""
     z = 0.0
     for i in range(3):
         z += (x[i] - surfaces.origin[s, i] - surfaces.velocity[s, i] * time) * surfaces.axes[s, i, 2]
-    return z < reach
+    return -surfaces.depth[s] - reach < z < reach
 
 
 @compiled

@@ -1,4 +1,7 @@
-"""Obstacles for the vehicle: floor, walls, ceiling and the panel with the pad, as rectangles with an outward normal."""
+"""Obstacles for the vehicle: floor, walls, ceiling and the panel with the pad, as rectangles with an outward normal.
+
+The panel is a box of six rectangles; a point inside is pushed out through the nearest one.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from perch_core.tag_board import load_board
 from perch_sim.scenario import Scenario
 
 FAR = 1e9          # extent of a plane without an end [m]
-PANEL_DEPTH = 0.1  # the panel is this thick [m]
+PANEL_DEPTH = 0.2  # the panel is this thick [m]
 
 
 class Surfaces(NamedTuple):
@@ -21,7 +24,7 @@ class Surfaces(NamedTuple):
     origin: np.ndarray     # p_WS at time zero, (m, 3) [m]
     axes: np.ndarray       # R_WS, (m, 3, 3)
     half_size: np.ndarray  # along s1 and s2, (m, 2) [m]
-    depth: np.ndarray      # how deep a point can be inside, (m,) [m]
+    depth: np.ndarray      # points deeper than this are not inside, (m,) [m]
     velocity: np.ndarray   # (m, 3) [m/s]
 
 
@@ -40,6 +43,17 @@ def _axes(normal: np.ndarray) -> np.ndarray:
     s1 = np.cross(helper, normal)
     s1 /= np.linalg.norm(s1)
     return np.stack([s1, np.cross(normal, s1), normal], axis=1)
+
+
+def _box(front: PerchSurface, size: tuple[float, float]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return origin [m], axes and half size [m] of the panel's faces: front, back, and those along its edges."""
+    (s1, s2, s3), half = front.R_WS.T, np.array([*size, PANEL_DEPTH]) / 2
+    centre = front.p_WS - half[2] * s3
+    faces = [(front.p_WS, front.R_WS, half[:2]), (centre - half[2] * s3, np.stack([s2, s1, -s3], axis=1), half[[1, 0]])]
+    for side in (1.0, -1.0):
+        faces.append((centre + side * half[0] * s1, np.stack([s2, side * s3, side * s1], axis=1), half[[1, 2]]))
+        faces.append((centre + side * half[1] * s2, np.stack([s3, side * s1, side * s2], axis=1), half[[2, 0]]))
+    return faces
 
 
 def pad_surface(scenario: Scenario, time: float) -> PerchSurface:
@@ -70,12 +84,14 @@ def make_obstacles(scenario: Scenario) -> Obstacles:
         pad, pad_half = len(names), np.array(load_board(scenario.target.board).pad_size) / 2
         if np.any(np.array(scenario.target.panel_size) / 2 < pad_half):
             raise ConfigError("", "target.panel_size", f"{list(scenario.target.panel_size)} m is below the pad's {(2 * pad_half).tolist()} m")
-        names.append("pad")
-        origin.append(surface.p_WS)
-        axes.append(surface.R_WS)
-        half.append(np.array(scenario.target.panel_size) / 2)
-        depth.append(PANEL_DEPTH)
-        velocity.append(np.array(scenario.target.velocity, float))
+        panel = _box(surface, scenario.target.panel_size)
+        names += ["pad", *["panel"] * 5]
+        for point, R, size in panel:
+            origin.append(point)
+            axes.append(R)
+            half.append(size)
+        depth += [PANEL_DEPTH / 2] * len(panel)
+        velocity += [np.array(scenario.target.velocity, float)] * len(panel)
     return Obstacles(
         Surfaces(np.array(origin), np.ascontiguousarray(np.array(axes)), np.array(half), np.array(depth), np.array(velocity)),
         tuple(names), pad, pad_half)

@@ -15,7 +15,7 @@ from perch_sim.attachment import FREE
 from perch_sim.body import PLATE_POINTS, Body, hold_rate, make_body
 from perch_sim.cable_contact import CableMonitor
 from perch_sim.contact import ContactMonitor
-from perch_sim.dynamics import GRAVITY, STATES, Hold, advance_to_touch
+from perch_sim.dynamics import GRAVITY, STATES, Hold, advance_to_touch, clearances
 from perch_sim.obstacles import make_obstacles
 from perch_sim.scenario import Scenario
 from perch_sim.state_history import TrueState
@@ -24,6 +24,7 @@ from perch_sim.wind import WindField
 
 SUBSTEPS = 4        # Runge-Kutta steps per period: 0.5 ms each
 STEP = CONTROL_PERIOD / SUBSTEPS
+START_DEPTH = 0.01  # to which the vehicle may stand in the panel at the start [m]
 STABLE = 2.78       # greatest (rate of a decay) * (step) at which a Runge-Kutta step of fourth order decays, too
 
 
@@ -57,8 +58,8 @@ class Plant:
             start: time of the initial state [ns].
 
         Raises:
-            ConfigError: the board does not exist, a disturbance does not suit the vehicle, or the plate is so far from the centre of
-                mass that steps of 0.5 ms cannot follow its hold.
+            ConfigError: the board does not exist, the vehicle would stand in the panel, a disturbance does not suit the vehicle, or
+                the plate is so far from the centre of mass that steps of 0.5 ms cannot follow its hold.
         """
         self.body = make_body(vehicle, scenario.disturbance)
         if hold_rate(self.body) * STEP > STABLE:
@@ -74,6 +75,7 @@ class Plant:
         self._wind = WindField(scenario.wind, CONTROL_PERIOD, seeding.stream(seed, "wind"))
         self._touched = np.zeros((len(self.obstacles.names), 3))
         self._warm_up()
+        self._check_start(scenario)
 
     @property
     def state(self) -> TrueState:
@@ -135,6 +137,14 @@ class Plant:
         elapsed = (self.time - self._start) * 1e-9
         contacts += [e._replace(stamp=self.time) for e in self.cables.update(elapsed, self._x)]
         return PlantOutput(states, total / SUBSTEPS, tuple(contacts))
+
+    def _check_start(self, scenario: Scenario) -> None:
+        """Check that the vehicle does not stand in the panel; a panel flush with the floor gives way as the floor does."""
+        clearances(self._x, self._x, self.body, self.obstacles.surfaces, 0.0, self._touched)
+        for name, (plate, rest, _) in zip(self.obstacles.names, self._touched):
+            if name in ("pad", "panel") and min(plate, rest) < -START_DEPTH:
+                x, y, z = scenario.start.position
+                raise ConfigError("", "start.position", f"({x:g}, {y:g}, {z:g}) m: the vehicle would stand in the panel around the pad")
 
     def _warm_up(self) -> None:
         """Compile the kernels on a copy of the state, so that the first step of a flight in real time is not delayed."""
