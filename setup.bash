@@ -14,19 +14,23 @@ _perch_prepend() {  # NAME FOLDER: put FOLDER first in the path variable NAME, o
   export "$1=$2${rest:+:$rest}"
 }
 
+_perch_end() {  # leave nothing of this file but the environment
+  unset -f _perch_prepend _perch_end
+  unset _perch_root _perch_folder
+  if [ -n "${_perch_nounset:-}" ]; then unset _perch_nounset; set -u; fi
+}
+
 if [ ! -f "$_perch_root/.venv/bin/activate" ] ||
   { [ ! -f "$_perch_root/install/setup.bash" ] && [ -z "${PERCH_WITHOUT_WORKSPACE:-}" ]; }; then
   echo "perch is not set up yet: run   python3 $_perch_root/scripts/setup.py   and source this file again" >&2
-  unset -f _perch_prepend
-  unset _perch_root
+  _perch_end
   return 1
 fi
 
 # Every socket of ROS is bound to this address (SECURITY.md). One that Fast DDS cannot read would open them all.
 if [[ ! "${PERCH_NETWORK:-127.0.0.1}" =~ ^((25[0-5]|2[0-4][0-9]|1?[0-9]?[0-9])(\.|$)){4}$ ]]; then
   echo "PERCH_NETWORK=$PERCH_NETWORK is not an address such as 127.0.0.1" >&2
-  unset -f _perch_prepend
-  unset _perch_root
+  _perch_end
   return 1
 fi
 
@@ -68,9 +72,4 @@ fi
 # The matrices here are small: threads inside numpy only take the cores from other nodes.
 export OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-unset -f _perch_prepend
-unset _perch_root _perch_folder
-if [ -n "${_perch_nounset:-}" ]; then
-  unset _perch_nounset
-  set -u
-fi
+_perch_end

@@ -76,8 +76,14 @@ def _pip(step: Step, environment: Mapping[str, str], total: int, *locks: Path, o
 
 
 def usable() -> bool:
-    """Return whether there is a completed environment; venv writes `activate` last."""
-    return VENV_PYTHON.exists() and (VENV_PYTHON.parent / "activate").exists() and not _UNFINISHED.exists()
+    """Return whether there is a completed environment whose Python still has the version for which the packages were installed.
+
+    venv writes `activate` last; its `python3` is a link, whose target an upgrade of the system can change.
+    """
+    if not VENV_PYTHON.exists() or not (VENV_PYTHON.parent / "activate").exists() or _UNFINISHED.exists():
+        return False
+    target = VENV_PYTHON.resolve().name
+    return re.fullmatch(r"python3\.\d+", target) is None or (VENV / "lib" / target).exists()
 
 
 def _environment(target: Platform) -> dict[str, str]:

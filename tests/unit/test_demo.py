@@ -26,6 +26,14 @@ def test_an_interrupted_flight_leaves_what_it_has_recorded_alone(tmp_path):
     assert [path.read_text() for path in tmp_path.iterdir()] == ["begun"]
 
 
+def test_a_flight_that_is_interrupted_before_it_records_leaves_the_earlier_recording(tmp_path):
+    recording = tmp_path / "flight.mcap"
+    recording.write_text("earlier")
+    with pytest.raises(KeyboardInterrupt), _replaced(recording):
+        raise KeyboardInterrupt
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["earlier"]
+
+
 @pytest.mark.parametrize("records", [True, False])
 def test_a_flight_that_ends_leaves_its_own_recording_or_none(tmp_path, records):
     recording = tmp_path / "flight.mcap"

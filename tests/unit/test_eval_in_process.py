@@ -32,8 +32,10 @@ def test_a_flight_without_vio_does_not_take_off():
     loop = arrange(load_scenario("surface_90"), 1)
     for channel in ("vio/state", "vio/odometry"):
         loop.filters["estimator", channel] = lambda now, value: None
-    trace = perch(loop, load_scenario("surface_90"))
-    assert trace.outcome == "timeout" and trace.values("vio/state") and not trace.values("odometry")
+    scenario = replace(load_scenario("surface_90"), time_limit=8.0)
+    trace = perch(loop, scenario)
+    assert trace.outcome == "timeout" and trace.end_time > 1e-9 * START + scenario.time_limit
+    assert trace.values("vio/state") and not trace.values("odometry")
     assert max(truth.p_WB[2] for truth in trace.values("ground_truth/odometry")) < 0.2
 
 

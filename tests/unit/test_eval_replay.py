@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from PIL import Image
+from PIL import Image, ImageSequence
 from unit.recorded_flights import BIAS, PATH, flown, record
 
 from perch_core.urdf import urdf
@@ -27,7 +27,7 @@ from perch_eval.flight_view import FlightView
 from perch_eval.mcap_log import read
 from perch_eval.metrics import figures, flight_metrics, perch_window, rates
 from perch_eval.page import Html, section, table
-from perch_eval.replay import command
+from perch_eval.replay import animation, command
 from perch_eval.replay.command import main
 from perch_eval.replay.stroboscope import stroboscope
 from perch_eval.ros.recorded_flight import RecordedFlight
@@ -137,6 +137,21 @@ def test_an_animation_has_a_frame_for_each_moment_and_plots_are_written(recorded
     with Image.open(gif) as image:
         assert image.n_frames == 4
     assert {"tracking.png", "path.png", "rates.png", "thrust.png"} <= {p.name for p in (tmp_path / "plots").iterdir()}
+
+
+@pytest.mark.parametrize("fps", [12.0, 15.0, 60.0])
+def test_an_animation_takes_its_time(fps, tmp_path):
+    animation._write_gif(tmp_path / "f.gif", fps, (np.full((8, 8, 3), k, np.uint8) for k in range(61)))
+    with Image.open(tmp_path / "f.gif") as image:
+        total = sum(frame.info["duration"] for frame in ImageSequence.Iterator(image))
+    assert total == pytest.approx(1000.0 * 61 / fps, abs=10.0)
+
+
+def test_two_recordings_of_a_flight_are_the_same_flight_though_one_has_a_report(recorded):
+    path, flight = recorded
+    one = comparison.read("a", "r", path)
+    other = replace(one, until=one.until - 0.1, report={**one.report, "flight_hash": flight.digest(one.until - 0.1)})
+    assert "to the last bit" in comparison.compare(one, other)
 
 
 def test_a_stroboscopic_picture_shows_each_instant_of_the_perch(recorded, tmp_path):

@@ -207,6 +207,16 @@ def test_an_environment_whose_creation_was_interrupted_is_not_used(environment):
     assert not virtualenv.usable()
 
 
+def test_an_environment_whose_python_was_upgraded_is_not_used(environment):
+    for version in ("python3.11", "python3.13"):
+        (environment / version).touch()
+    (environment.parent / "lib" / "python3.11").mkdir(parents=True)
+    for version, usable in (("python3.11", True), ("python3.13", False)):
+        (environment / "python").unlink()
+        (environment / "python").symlink_to(environment / version)
+        assert virtualenv.usable() is usable
+
+
 @pytest.mark.parametrize("tool", ["venv", "pip"])
 def test_an_environment_that_is_killed_at_any_step_is_made_anew(environment, monkeypatch, tool):
     class Killed(BaseException):

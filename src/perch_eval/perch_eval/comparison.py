@@ -13,6 +13,7 @@ from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.arguments import command, command_parser
+from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
 from perch_eval.margins import limits, margins, number
 from perch_eval.metrics import FIGURES, figures, flight_metrics
@@ -32,8 +33,10 @@ exit code: 0 written, 2 invalid input (no such recording, nothing in it)"""
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two flights: the recording, figures from it and from its `report.json`, and whether the vehicle is known."""
+    """One of the two flights: the recording, its end [s], figures from it and from its `report.json`, and whether the vehicle is known."""
 
+    flight: Flight
+    until: float
     view: FlightView
     report: dict[str, Any]
     known: bool
@@ -89,13 +92,14 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
     report = {**report, **flight_metrics(flight, until), "flight_hash": report.get("flight_hash") or flight.digest(until)}
     found = {one["name"]: one for one in report.get("margins", ()) if one.get("left") is not None}
     found |= {one.name: one.mapping() for one in margins(flight, model) if identified is not None}
-    return Side(view, report | {"margins": list(found.values())}, identified is not None)
+    return Side(flight, until, view, report | {"margins": list(found.values())}, identified is not None)
 
 
 def compare(a: Side, b: Side) -> str:
     """Return the page as HTML."""
     sides, views = (a, b), (a.view, b.view)
-    same = a.report["flight_hash"] == b.report["flight_hash"]
+    until = min(a.until, b.until)
+    same = a.flight.digest(until) == b.flight.digest(until)
     verdict = "The two are the same flight, to the last bit." if same else "The two are different flights."
     drawn = {"Path, side view": plots.path_figure, "Position and velocity": plots.tracking_figure, "Errors": plots.distance_figure,
                "Rates and tilt": plots.rates_figure}

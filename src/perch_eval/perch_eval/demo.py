@@ -95,14 +95,14 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
 
 @contextmanager
 def _replaced(recording: Path) -> Iterator[None]:
-    """Move an earlier recording aside, as this flight may end before it records; restore it after a `PerchError`."""
+    """Move an earlier recording aside; restore it after a `PerchError`, or where this flight is interrupted before it records."""
     aside = recording.with_suffix(".earlier")
     if recording.exists():
         recording.replace(aside)
     try:
         yield
-    except PerchError:
-        if aside.exists():
+    except BaseException as error:
+        if aside.exists() and (isinstance(error, PerchError) or not recording.exists()):
             aside.replace(recording)
         raise
     finally:

@@ -20,7 +20,7 @@ from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.in_process.trace import FlightTrace
 from perch_perception.target_localizer import TargetLocalizerConfig
 from perch_sim.drawing import OnDemandRendering
-from perch_sim.lockstep import Task, flight_tasks
+from perch_sim.lockstep import START, Task, flight_tasks
 from perch_sim.parameters import CAMERAS, VehicleParameters
 from perch_sim.scenario import Scenario
 from perch_sim.simulated_vehicle import SimulatedVehicle
@@ -109,7 +109,7 @@ def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
     """Fly an arranged flight from the scenario's goal to its end; arguments as those of `fly`."""
     began = clock.perf_counter()
     goal = loop.send("mission", goal_of(scenario))
-    limit = round(scenario.time_limit * NANOSECONDS)
+    limit = START + round(scenario.time_limit * NANOSECONDS)
     stamp = 0
     with without_collector():  # a trace only grows: collecting garbage in it takes a tenth of a flight's time
         while goal.result is None and stamp < limit + CANCEL_TIME:

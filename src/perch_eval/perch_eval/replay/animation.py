@@ -132,7 +132,8 @@ def _frames(scene: Scene, times: np.ndarray) -> Iterator[np.ndarray]:
 
 def _write_gif(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
     first, *others = (Image.fromarray(frame) for frame in frames)
-    first.save(path, save_all=True, append_images=others, duration=round(1000.0 / fps), loop=0)
+    ends = np.round(100.0 / fps * np.arange(1, len(others) + 2)).astype(int)  # GIF delays are multiples of 10 ms
+    first.save(path, save_all=True, append_images=others, duration=(10 * np.diff(ends, prepend=0)).tolist(), loop=0)
 
 
 def _write_mp4(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
