@@ -186,6 +186,20 @@ def test_standing_still_is_not_blurred():
                                   renderer.render([pose], np.random.default_rng(0)))
 
 
+def test_the_blur_of_the_pad_is_that_of_its_motion_relative_to_the_camera():
+    """A pad that moves with the camera is as sharp as at rest; one that passes a camera at rest is blurred as a pad at rest in passing."""
+    path = np.outer(np.linspace(-0.01, 0.01, 5), [0.0, 1.0, 0.0])
+    moving, resting, renderer = [level(0.7, y, 1.2) for y in path[:, 1]], [level(0.7, 0.0, 1.2)] * 5, Renderer(WALL, FRONT)
+
+    def pad(poses, shifts) -> np.ndarray:
+        return renderer.render(poses, np.random.default_rng(0), shifts)[175:305, 255:385].astype(float)
+
+    still, passing = pad(resting, 0.0 * path), pad(moving, 0.0 * path)
+    assert np.abs(still - passing).mean() > 3.0
+    assert np.abs(pad(moving, path) - still).mean() < 0.2
+    assert np.abs(pad(resting, -path) - passing).mean() < 0.2
+
+
 def test_a_hall_of_60_m_needs_no_more_memory_than_a_room():
     def texels(scene: Scene) -> float:
         return sum(4 * face.half[0] * face.half[1] / face.texel**2 for face in scene.faces() if face.kind == "room")

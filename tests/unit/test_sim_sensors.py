@@ -10,6 +10,7 @@ from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_sim import seeding
+from perch_sim.camera_stream import CameraStream
 from perch_sim.camera_timing import CameraTiming
 from perch_sim.imu import Imu
 from perch_sim.motors import MotorCommandError, Motors
@@ -73,6 +74,19 @@ def test_frames_keep_their_rate_and_arrive_after_read_out_and_transport():
         assert 9_300_000 + 5_000_000 <= f.arrival - f.end <= 9_300_000 + 10_000_000
     delays = np.array([f.arrival - f.end for f in frames]) * 1e-6
     assert delays.std() == pytest.approx(5 / np.sqrt(12), rel=0.1)
+
+
+def test_an_exposure_has_the_displacement_of_a_moving_pad_at_each_of_its_poses():
+    exposures, history, velocity = [], StateHistory(200), np.array([0.0, 2.0, -1.0])
+    mount = VEHICLE.mounts["front"]
+    for time in range(0, 100_000_001, 500_000):
+        history.append(TrueState(time, np.array([1e-9 * time, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    timing = CameraTiming(mount, 0.008, 30_000_000, np.random.default_rng(1))
+    CameraStream(mount, timing, exposures.append, np.random.default_rng(2), velocity, 10_000_000).expose(100_000_000, history)
+    poses, _, shifts = exposures[0]()
+    times = np.array([p[0] for p, _ in poses])  # it flies at 1 m/s
+    assert times[-1] - times[0] == pytest.approx(0.008, abs=1e-8)
+    np.testing.assert_allclose(shifts, np.outer(times - 0.01, velocity), atol=1e-7)
 
 
 def test_history_interpolates_a_turning_climb():

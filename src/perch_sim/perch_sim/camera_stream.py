@@ -92,13 +92,14 @@ class CameraStream:
         return self.max_pending_images is not None and pending >= self.max_pending_images
 
     def _sample_exposure(self, frame: Frame, history: StateHistory) -> Exposure:
-        brackets = [history.bracket(int(t)) for t in np.linspace(frame.start, frame.end, POSES)]
+        times = np.linspace(frame.start, frame.end, POSES)
+        brackets = [history.bracket(int(t)) for t in times]
         seed = np.random.SeedSequence(self._seed.entropy, spawn_key=(*self._seed.spawn_key, self._image_count))
         self._image_count += 1
-        return partial(_exposure, brackets, seed, self._velocity * (frame.middle - self._start) * 1e-9)
+        return partial(_exposure, brackets, seed, np.outer((times - self._start) * 1e-9, self._velocity))
 
 
-def _exposure(brackets: list[Bracket], seed: np.random.SeedSequence, shift: np.ndarray) -> tuple[list[Pose], np.random.Generator, np.ndarray]:
+def _exposure(brackets: list[Bracket], seed: np.random.SeedSequence, shifts: np.ndarray) -> tuple[list[Pose], np.random.Generator, np.ndarray]:
     """Return the arguments of `Renderer.render`."""
     p_WB, q_WB = between(brackets)
-    return list(zip(p_WB, so3.quat_to_matrix(q_WB))), np.random.default_rng(seed), shift
+    return list(zip(p_WB, so3.quat_to_matrix(q_WB))), np.random.default_rng(seed), shifts

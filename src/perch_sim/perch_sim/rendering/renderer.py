@@ -64,17 +64,20 @@ class Renderer:
         Args:
             poses: (p_WB [m], R_WB) of the body, evenly spread over the exposure, one or more.
             rng: random generator of this frame's noise.
-            target_shift: displacement of the target panel and its pad from their positions in the scene [m], shape (3,).
+            target_shift: displacement of the target panel and its pad from their positions in the scene [m], shape (3,), or (n, 3):
+                one for each pose.
             region: rows and columns to render; the rest of the image is black. None: all of it.
 
         Returns:
             mono8, uint8 (height, width); with `mount.colour` rgb8, uint8 (height, width, 3).
         """
-        shift_W = np.asarray(target_shift, dtype=float)
+        shifts_W = np.broadcast_to(np.asarray(target_shift, dtype=float), (len(poses), 3))
         poses = [(np.asarray(p, dtype=float), np.asarray(R, dtype=float)) for p, R in poses]
         region = region or self._whole
         blurred = self._sensor.blur_region(region)
-        frames = [self._light(*self.mount.pose(p, R), shift_W, blurred) for p, R in spread(poses, self._subframes(poses))]
+        count = self._subframes(poses, shifts_W)
+        frames = [self._light(*self.mount.pose(p, R), shift_W, blurred)
+                  for (p, R), shift_W in zip(spread(poses, count), spread_shifts(shifts_W, count))]
         light = frames[0]
         if len(frames) > 1:
             mean = sum(frame[blurred].astype(np.uint16) for frame in frames)
@@ -91,14 +94,17 @@ class Renderer:
             self._cables.paint(image, p_WC, R_WC, M[front], self._faces.half[front])
         return image
 
-    def _subframes(self, poses: list[Pose]) -> int:
+    def _subframes(self, poses: list[Pose], shifts_W: np.ndarray) -> int:
         """Return the number of sub-frames that the motion across the image during the exposure requires."""
         if len(poses) < 2:
             return 1
         (p0, R0), (p1, R1) = (self.mount.pose(*pose) for pose in (poses[0], poses[-1]))
-        depth = np.maximum(np.abs((self._faces.centre_W - p0) * self._faces.normal_W).sum(axis=1), 0.05)
+        moving, path_W = self._faces.moving, p1 - p0
+        centre_W = self._faces.centre_W + moving[:, None] * shifts_W[0]
+        depth = np.maximum(np.abs((centre_W - p0) * self._faces.normal_W).sum(axis=1), 0.05)
+        travel = np.where(moving, np.linalg.norm(path_W - (shifts_W[-1] - shifts_W[0])), np.linalg.norm(path_W))  # relative to each face
         turn = 2.0 * np.arcsin(min(np.linalg.norm(R1 - R0) / np.sqrt(8.0), 1.0))
-        motion = self.mount.camera.fx * (turn + np.linalg.norm(p1 - p0) / np.sort(depth)[1])  # the second nearest
+        motion = self.mount.camera.fx * (turn + np.sort(travel / depth)[-2])  # of the face with the second fastest image
         return int(np.clip(np.ceil(motion / BLUR_STEP), 1, MAX_SUBFRAMES))
 
 
@@ -113,3 +119,9 @@ def spread(poses: list[Pose], count: int) -> list[Pose]:
         (p0, R0), (p1, R1) = poses[before], poses[before + 1]
         out.append((p0, R0) if part == 0.0 else (p0 + part * (p1 - p0), R0 @ so3.exp(part * so3.log(R0.T @ R1))))
     return out
+
+
+def spread_shifts(shifts_W: np.ndarray, count: int) -> np.ndarray:
+    """Return the displacements (count, 3) at the times of `spread`, from those of the poses (n, 3)."""
+    share = (np.arange(count) + 0.5) / count * (len(shifts_W) - 1)
+    return np.stack([np.interp(share, np.arange(len(shifts_W)), column) for column in shifts_W.T], axis=1)
