@@ -139,3 +139,13 @@ def test_scenario_cables_hang_where_the_scenario_says():
     bare = light(Scene(scene.room_low, scene.room_high, contrast=0.0), PINHOLE)
     rows = np.abs(image - bare)[:, 320]
     assert np.average(np.arange(480), weights=rows) == pytest.approx(240 - PINHOLE.fy * 0.1 / 4.0, abs=0.2)
+
+
+@pytest.mark.parametrize("sag", [0.0, 0.5, 4.0])
+def test_a_scenarios_cable_is_drawn_within_a_millimetre_however_it_sags(sag):
+    cable = Cable(start=(4.0, -2.0, 5.0), end=(4.0, 2.0, 5.5), sag=sag)
+    drawn = build_scene(Scenario(name="lines", mode="powerline", world=World(cables=(cable,)))).cables[0].points_W
+    start, piece = drawn[:-1], np.diff(drawn, axis=0)
+    for p in cable.catenary().sample(700):
+        along = np.clip(((p - start) * piece).sum(axis=1) / (piece * piece).sum(axis=1), 0.0, 1.0)
+        assert np.linalg.norm(start + along[:, None] * piece - p, axis=1).min() < 1e-3

@@ -104,3 +104,10 @@ def test_the_line_is_the_catenary():
     dense = Catenary.from_sag(np.array(cable.start), np.array(cable.end), cable.sag).sample(20_001)
     for p in np.random.default_rng(1).uniform([-1, -4, 2], [2, 4, 5], (50, 3)):
         assert line.nearest(p).distance == pytest.approx(np.linalg.norm(dense - p, axis=1).min(), abs=1.5e-3)
+
+
+@pytest.mark.parametrize("sag", [0.0, 0.5, 2.0, 4.0])
+def test_the_line_is_within_a_millimetre_however_the_cable_sags(sag):
+    cable = Cable(start=(4.0, -2.0, 5.0), end=(4.0, 2.0, 5.5), sag=sag)
+    line = CableLine(cable)
+    assert max(line.nearest(p).distance for p in cable.catenary().sample(700)) < 1e-3

@@ -131,6 +131,13 @@ class Catenary:
         """`count` points in W from start to end, evenly spread along the cable [m], shape (count, 3)."""
         return self.point(np.linspace(0.0, self.length, count))
 
+    def pieces(self, max_error: float) -> int:
+        """Number of equally long pieces whose chords are within `max_error` [m] of the cable.
+
+        The sagitta of a piece of the length h is at most h^2 / 8 times the greatest curvature, 1/a at the lowest point.
+        """
+        return max(1, math.ceil(self.length / math.sqrt(8 * self.parameter * max_error)))
+
 
 @dataclass(frozen=True, eq=False)
 class SegmentFit:

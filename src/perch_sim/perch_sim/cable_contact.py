@@ -22,7 +22,7 @@ from perch_sim.scenario import Cable, Grip
 
 TOUCH = 0.01       # nearer than this the cable is in the claw [m]
 LEAVING = 0.02     # ... and it has left when it is this far beyond the tolerance of position [m]
-MAX_ERROR = 1e-3   # of a cable's straight pieces [m]
+MAX_ERROR = 1e-3   # of the straight pieces for a cable [m]
 
 
 class Nearest(NamedTuple):
@@ -37,9 +37,8 @@ class CableLine:
     """A cable, approximated by straight pieces."""
 
     def __init__(self, cable: Cable) -> None:
-        # the sagitta of an arc: pieces so short that none is further than MAX_ERROR from the cable
-        pieces = math.ceil(math.sqrt(max(1.0, cable.sag / MAX_ERROR)))
-        points = cable.catenary().sample(pieces + 1)
+        catenary = cable.catenary()
+        points = catenary.sample(catenary.pieces(MAX_ERROR) + 1)
         self._start, chord = points[:-1], np.diff(points, axis=0)
         self._length = np.linalg.norm(chord, axis=1)
         self._direction = chord / self._length[:, None]

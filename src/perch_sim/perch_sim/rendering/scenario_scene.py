@@ -10,7 +10,8 @@ from perch_sim.rendering.scene import CableCurve, Scene
 from perch_sim.scenario import Cable, Scenario
 
 CABLE_COLOURS = {"red": (190.0, 35.0, 35.0), "grey": (88.0, 88.0, 92.0)}  # rgb under full light
-CABLE_SPACING = 0.25  # between the points of a cable's polyline [m]
+CABLE_SPACING = 0.25  # between the points of a cable's polyline, at most [m]
+CABLE_ERROR = 1e-3  # of the polyline [m]
 
 
 def build_scene(scenario: Scenario, seed: int = 0) -> Scene:
@@ -38,5 +39,5 @@ def build_scene(scenario: Scenario, seed: int = 0) -> Scene:
 
 def _curve(cable: Cable) -> CableCurve:
     catenary = cable.catenary()
-    count = max(2, int(np.ceil(catenary.length / CABLE_SPACING)) + 1)
+    count = 1 + max(int(np.ceil(catenary.length / CABLE_SPACING)), catenary.pieces(CABLE_ERROR))
     return CableCurve(catenary.sample(count), cable.radius, CABLE_COLOURS[cable.colour])
