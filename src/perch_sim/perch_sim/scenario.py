@@ -103,7 +103,8 @@ class Disturbance:
     rotor_thrust_factor: Vector4 = quantity((1.0, 1.0, 1.0, 1.0), low=0.0, high=1.5)
     motor_lag_factor: float = quantity(1.0, low=0.1, high=5.0)
     loop_lag_factor: float = quantity(1.0, low=0.1, high=5.0, doc="of an ideal inner loop; 1 on other vehicles")
-    voltage_factor: float = quantity(1.0, low=0.5, high=1.2, doc="battery / that of the thrust curve: rotor speed at a firmware's throttle; 1 on other vehicles")
+    voltage_factor: float = quantity(
+        1.0, low=0.5, high=1.2, doc="battery / that of the thrust curve: rotor speed at a firmware's throttle; 1 on other vehicles")
     surface_effect: bool = quantity(False, doc="ground and wall effect near surfaces; needs the vehicle's propeller_radius")
 
 
