@@ -82,10 +82,10 @@ STAMPS = count(NANOSECONDS, NANOSECONDS // 50)  # as often as odometry goes out
 
 @given(p=VECTORS, R=ROTATIONS, v=VECTORS, w=VECTORS, P=SPREADS, Q=SPREADS)
 @settings(max_examples=50, deadline=None)
-def test_odometry_goes_out_as_frd_in_ned(node, p, R, v, w, P, Q):
+def test_odometry_goes_out_as_frd_in_local_frd(node, p, R, v, w, P, Q):
     node.on_odometry(OdometryState(next(STAMPS), tuple(p), tuple(R.as_quat()), tuple(v), tuple(w), P, Q))
     _, frame, child, *place, q, vx, vy, vz, rx, ry, rz, pose, twist = node._mavlink.sent["odometry"]
-    assert (frame, child) == (1, 12)                                                   # MAV_FRAME_LOCAL_NED, MAV_FRAME_BODY_FRD
+    assert (frame, child) == (20, 12)                                                  # MAV_FRAME_LOCAL_FRD, MAV_FRAME_BODY_FRD
     assert place == pytest.approx(NED.apply(p)) and same((*q[1:], q[0]), NED * R * FRD.inv())  # wxyz
     assert (vx, vy, vz) == pytest.approx(FRD.apply(v), abs=1e-9) and (rx, ry, rz) == pytest.approx(FRD.apply(w), abs=1e-9)
     for sent, axes, covariance in ((pose, NED, P), (twist, FRD, Q)):

@@ -69,7 +69,7 @@ class ArrivalNode(ComponentNode):
         self.wiring.enter(self.guarded, port.name, work, *arguments)
 
     def _send_request(self, name: str, send: Send, request: Any, due: int) -> None:
-        """Send a component's request; `due` has a meaning in lockstep only."""
+        """Send a component's request; its answer arrives when it does, whatever `due`."""
         send(request, partial(self.wiring.enter, self.guarded, name, getattr(self.component, f"on_{name}")))
 
     # -- diagnostics and priority --------------------------------------------------------------------------------------
