@@ -2,10 +2,11 @@
 
 import json
 import math
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from scipy.stats import kstest
 
 from perch_core import config
-from perch_core.errors import ConfigError
+from perch_core.errors import ConfigError, PerchError
 from perch_core.values import Contact
 from perch_eval import demo
 from perch_eval.campaign import command as campaign
@@ -27,7 +28,7 @@ from perch_eval.campaign.specification import Run, load_campaign
 from perch_eval.evaluation import command as evaluation
 from perch_eval.statistics import Rate, Spread
 from perch_sim.contact_event import ContactState
-from perch_sim.scenario import Adhesion, Scenario
+from perch_sim.scenario import Scenario
 
 
 def write(folder, text):
@@ -162,7 +163,17 @@ ATTACHED, BOUNCED, COLLISION = ContactState.ATTACHED, ContactState.BOUNCED, Cont
     ("crashed", [touch(BOUNCED, tilt=30.0, reason="tilt error"), touch(COLLISION, "floor", reason="crashed: floor")], "tilt"),
 ])
 def test_causes_come_from_the_first_thing_that_went_wrong(outcome, touches, cause):
-    assert cause_of(outcome, [GROUND, NONE, *touches], Adhesion()) == cause
+    assert cause_of(outcome, [GROUND, NONE, *touches], Scenario(name="s")) == cause
+
+
+@pytest.mark.parametrize("values, grip, cause", [
+    (dict(offset=0.16), {}, "missed_pad"), (dict(speed=0.6), {}, "too_fast"), (dict(tilt=20.0), {}, "tilt"), (dict(offset=0.16, speed=0.5), {}, "missed_pad"),
+    (dict(), {"enabled": False}, "missed_pad"), (dict(speed=0.6), {"speed": 1.0, "position": 0.01}, "missed_pad")])
+def test_a_missed_cable_is_judged_by_the_limits_of_the_gripper(values, grip, cause):
+    """By those of the velcro, 0.6 m/s is neither too fast nor 16 cm too far."""
+    values = {"offset": 0.04, "speed": 0.05, "tilt": 2.0} | values
+    missed = Contact(5_000_000_000, BOUNCED, "cable 0", values["speed"], 0.0, math.radians(values["tilt"]), values["offset"], "missed")
+    assert cause_of("missed", [GROUND, NONE, missed], config.from_mapping(Scenario, {"name": "line", "grip": grip}, "s")) == cause
 
 
 def test_results_outlive_the_writer_and_are_read_while_it_writes(tmp_path):
@@ -190,6 +201,36 @@ def test_a_row_that_was_cut_off_does_not_count_and_is_flown_again(tmp_path):
         assert [r.number for r in results.all()] == [0, 1]
         results.add(RunResult(2, 2, "perched", "perched", ""))
     assert [r.number for r in read_results(path)[1]] == [0, 1, 2]
+
+
+def test_runs_that_could_not_be_carried_out_are_flown_again(tmp_path, monkeypatch):
+    specification, path, flown, cause = load_campaign(write(tmp_path, "name: c\nruns: 2\n")), tmp_path / "r.jsonl", [], "error"
+
+    def in_pool(tasks, jobs):
+        for task in tasks:
+            flown.append(task.run.number)
+            yield RunResult(task.run.number, task.run.seed, cause if task.run.number else "perched", "", "OSError: No space left on device")
+
+    monkeypatch.setattr(campaign, "in_pool", in_pool)
+    for cause in ("error", "perched", "perched"):
+        with closing(Results(path, "c", "digest", resume=True)) as results:
+            campaign.fly_all(specification, results, 1, None)
+    assert flown == [0, 1, 1] and [r.cause for r in read_results(path)[1]] == ["perched", "perched"]
+
+
+def test_results_are_resumed_with_the_same_vehicle_and_code_only(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    vehicle, file = tmp_path / "v.yaml", tmp_path / "s.yaml"
+    file.write_text(f"extends: surface_90\nvehicle: {vehicle}\n")
+    specification = write(tmp_path, f"name: c\nscenario: {file}\nruns: 1\n")
+    monkeypatch.setattr(campaign, "fly_all", interrupted)
+    for mass, code, end in ((0.25, "0123", 130), (0.25, "0123", 130), (0.35, "0123", 2), (0.25, "4567", 2)):
+        vehicle.write_text(f"extends: snapdragon\nmass: {mass}\n")
+        monkeypatch.setattr(campaign, "digest", lambda: code)
+        assert campaign.main([str(specification), "--out", str(tmp_path / "out"), "--resume"]) == end
+        assert ("other settings or code" in capsys.readouterr().err) == (end == 2)
 
 
 @pytest.mark.parametrize("damage", [
@@ -285,6 +326,48 @@ def test_a_run_that_a_broken_pool_refuses_goes_on_waiting(monkeypatch, broken_at
     monkeypatch.setattr(workers, "run_task", lambda task: RunResult(task.run.number, task.run.seed, "perched", "perched", ""))
     tasks = [Task(Run(n, 0, {}), {}, "", "") for n in range(12)]
     assert {r.number for r in workers.in_pool(tasks, 2)} == set(range(12))
+
+
+@pytest.fixture
+def dying(monkeypatch):
+    """The items of each pool, of one that breaks as soon as it has the item `poison`."""
+    pools = []
+
+    class Pool:
+        def __init__(self, jobs, mp_context, initializer):
+            pools.append([])
+
+        def submit(self, function, work, item):
+            pools[-1].append(item)
+            future = Future()
+            future.item = item
+            return future
+
+        def shutdown(self, wait, cancel_futures):
+            pass
+
+    def wait(pending, return_when):
+        for future in pending:
+            if any(other.item == "poison" for other in pending):
+                future.set_exception(BrokenProcessPool())
+            else:
+                future.set_result(future.item.upper())
+        return SimpleNamespace(done=list(pending))
+
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(workers, "wait", wait)
+    return pools
+
+
+def test_an_item_at_which_workers_die_costs_no_other_its_result(dying):
+    found = dict(workers.in_processes(str.upper, ["a", "b", "poison", "c", "d", "e"], 2, lambda item: "given up"))
+    assert found == {"a": "A", "b": "B", "poison": "given up", "c": "C", "d": "D", "e": "E"}
+    assert dying.count(["poison"]) == workers.ATTEMPTS
+
+
+def test_the_item_at_which_workers_die_is_named(dying):
+    with pytest.raises(PerchError, match="a process has died 3 times at poison"):
+        list(workers.in_processes(str.upper, ["a", "b", "poison", "c"], 2))
 
 
 def test_work_in_processes_ends_with_whoever_waits_for_it(monkeypatch):

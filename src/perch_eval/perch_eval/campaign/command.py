@@ -10,12 +10,13 @@ from contextlib import closing
 from pathlib import Path
 
 from perch_eval.arguments import command, command_parser, count, output_folder
-from perch_eval.campaign.causes import MEANING, SUCCESS
+from perch_eval.campaign.causes import ERROR, MEANING, SUCCESS
 from perch_eval.campaign.engines import ENGINES, Task, run_task, resolve
 from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.results import Results, RunResult, flight_folder, worst
 from perch_eval.campaign.specification import Campaign, load_campaign
 from perch_eval.campaign.workers import in_pool, on_cluster
+from perch_eval.revision import digest
 from perch_eval.statistics import Rate
 
 EXAMPLES = """examples:
@@ -36,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--runs", type=count, metavar="N", help="flights, with grids per grid point (default: the file's)")
     out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes (default: %(default)s)")
     out.add_argument("--cluster", metavar="ADDRESS", help="Dask scheduler (SECURITY.md)")
-    out.add_argument("--resume", action="store_true", help="continue with the results in --out")
+    out.add_argument("--resume", action="store_true", help="continue with the results in --out, of the same code; what could not be carried out is repeated")
     out.add_argument("--out", type=Path, metavar="DIR", help="folder of results and report (default: out/campaigns/<name>)")
     return out
 
@@ -46,7 +47,7 @@ def _run_campaign(args: argparse.Namespace) -> int:
     resolve(campaign.engine)
     out = output_folder(args.out or Path("out") / "campaigns" / campaign.name)
     file = out / "results.jsonl"
-    with closing(Results(file, campaign.name, campaign.digest, args.resume)) as results:
+    with closing(Results(file, campaign.name, f"{campaign.digest} {digest()}", args.resume)) as results:
         try:
             fly_all(campaign, results, args.jobs, args.cluster)
             from perch_eval.campaign.report import write_report  # draws figures: not needed before, nor by workers
@@ -55,27 +56,26 @@ def _run_campaign(args: argparse.Namespace) -> int:
             keep_worst(campaign, found, out)
             report = write_report(campaign, found, out)
         except KeyboardInterrupt:
-            print(f"\ninterrupted: {len(results.all())} of {len(campaign.runs)} results are in {file}; continue with --resume", file=sys.stderr)
+            print(f"\ninterrupted: {len(results.finished)} of {len(campaign.runs)} results are in {file}; continue with --resume", file=sys.stderr)
             return 130
     print(summary(found))
     print(f"results: {file}\nreport: {report}")
-    return 1 if any(r.cause == "error" for r in found) else 0
+    return 1 if any(r.cause == ERROR for r in found) else 0
 
 
 def fly_all(campaign: Campaign, results: Results, jobs: int, cluster: str | None) -> None:
-    """Fly every run that has no result yet.
+    """Fly every run that was not carried out yet.
 
     Raises:
         PerchError: the cluster does not answer.
         KeyboardInterrupt: interrupted; the results of finished runs are written.
     """
-    known = results.all()
-    finished = {r.number for r in known}
+    finished = results.finished
     tasks = [Task.from_campaign(campaign, run) for run in campaign.runs if run.number not in finished]
     print(f"{campaign.name}: {len(tasks)} of {len(campaign.runs)} runs to fly on {campaign.engine}, "
           + (f"Dask {cluster}" if cluster else f"{jobs} process{'es' if jobs > 1 else ''}"), flush=True)
     flown = on_cluster(tasks, cluster) if cluster else in_pool(tasks, jobs)
-    good = sum(r.cause == SUCCESS for r in known)
+    good = sum(r.cause == SUCCESS for r in results.all())
     for result in with_progress(flown, len(campaign.runs), lambda r: r.cause == SUCCESS, initial=len(finished), initial_good=good):
         results.add(result)
 

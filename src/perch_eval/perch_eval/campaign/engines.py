@@ -19,7 +19,7 @@ from perch_core.errors import PerchError
 from perch_core.processes import single_threaded_blas
 from perch_core.registry import resolved
 from perch_core.vehicle import Vehicle, load_vehicle
-from perch_eval.campaign.causes import cause_of
+from perch_eval.campaign.causes import ERROR, cause_of
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Campaign, Run
 from perch_eval.flight import Flight
@@ -67,14 +67,14 @@ def resolve(name: str) -> Callable[[Task], RunResult]:
 
 
 def run_task(task: Task) -> RunResult:
-    """Fly one run; an exception becomes a result with the cause `error`."""
+    """Fly one run; an exception becomes a result with the cause `error`, which does not count when the campaign resumes."""
     began = time.perf_counter()
     single_threaded_blas()
     cv2.setNumThreads(1)  # runs share the cores already; OpenCV's own threads cost each of them 15 % more CPU time
     try:
         result = resolve(task.engine)(task)
     except Exception as error:  # one run that breaks must not end the campaign; its message is in the results
-        result = RunResult(task.run.number, task.run.seed, "error", "failed", f"{type(error).__name__}: {error}")
+        result = RunResult(task.run.number, task.run.seed, ERROR, "failed", f"{type(error).__name__}: {error}")
     return dataclasses.replace(result, values=task.run.values, wall_time=time.perf_counter() - began)
 
 
@@ -102,7 +102,7 @@ def fly_in_process(task: Task, measure: Measure = lambda *_: {}, linger: float =
         write(folder / "flight.mcap", trace.timeline())
         (folder / "scenario.yaml").write_text(yaml.safe_dump(task.scenario))
         build_report(folder, scenario, task.run.seed, trace.outcome, trace.message, trace.wall_time, trace.end_time)
-    return RunResult(task.run.number, task.run.seed, cause_of(trace.outcome, trace.contacts, scenario.adhesion),
+    return RunResult(task.run.number, task.run.seed, cause_of(trace.outcome, trace.contacts, scenario),
                      trace.outcome, trace.message, metrics=metrics | measure(trace.flight, scenario, vehicle))
 
 
@@ -117,12 +117,12 @@ def fly_on_the_stack(task: Task) -> RunResult:
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / "scenario.yaml"
         file.write_text(yaml.safe_dump(task.scenario))
+        scenario = load_scenario(file)
         log = stack.enter_context(open(folder / "flight.log", "w"))
         with contextlib.redirect_stdout(log):
             report = fly(str(file), task.run.seed, folder, composed=ALL_NODES)
         contacts = [contact for _, contact in RecordedFlight(folder / "flight.mcap").values("contact")]
-        adhesion = load_scenario(file).adhesion
-    return RunResult(task.run.number, task.run.seed, cause_of(report["outcome"], contacts, adhesion), report["outcome"],
+    return RunResult(task.run.number, task.run.seed, cause_of(report["outcome"], contacts, scenario), report["outcome"],
                      report["message"], metrics=figures(report, report["simulated_time_s"]))
 
 

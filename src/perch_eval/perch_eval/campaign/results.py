@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from perch_core.errors import PerchError
-from perch_eval.campaign.causes import SUCCESS
+from perch_eval.campaign.causes import ERROR, SUCCESS
 from perch_eval.rows import Rows, rows_of
 
 
@@ -45,8 +45,8 @@ class Results:
         """
         header, found = read_results(path)
         if header and header.get("digest") != digest:
-            raise ResultsError(f"{path} holds results of campaign {header.get('name')!r} with other settings: "
-                               "choose another --out, or the original settings")
+            raise ResultsError(f"{path} holds results of campaign {header.get('name')!r} with other settings or code: "
+                               "choose another --out, or the original settings and code")
         if found and not resume:
             raise ResultsError(f"{path} already holds {len(found)} results: --resume continues with them, another --out starts a new campaign")
         self._results = {result.number: result for result in found}
@@ -56,10 +56,16 @@ class Results:
             raise _unreadable(path, error) from None
 
     def add(self, result: RunResult) -> None:
-        """Write the row of a run, unless the file already holds that run."""
-        if result.number not in self._results:
-            self._rows.add(asdict(result))
-            self._results[result.number] = result
+        """Write the row of a run, unless the file already holds it; a row with the cause `error` is replaced."""
+        if result.number in self.finished:
+            return
+        self._rows.add(asdict(result))
+        self._results[result.number] = result
+
+    @property
+    def finished(self) -> set[int]:
+        """Numbers of the runs that were carried out."""
+        return {number for number, result in self._results.items() if result.cause != ERROR}
 
     def all(self) -> list[RunResult]:
         """Return all results, sorted by number."""
@@ -73,14 +79,15 @@ class Results:
 def read_results(path: Path) -> tuple[dict[str, Any], list[RunResult]]:
     """Return a file's header row and its results sorted by number; both are empty where there is no file.
 
-    The file may be read while a campaign is writing it.
+    The file may be read while a campaign is writing it. Of several rows of a run the last one counts.
 
     Raises:
         ResultsError: the file cannot be read.
     """
     try:
         header, *rows = [*rows_of(path)] or [{}]
-        return dict(header), sorted((_result(**row) for row in rows), key=lambda result: result.number)
+        found = {result.number: result for result in (_result(**row) for row in rows)}
+        return dict(header), [found[number] for number in sorted(found)]
     except (OSError, ValueError, TypeError, RecursionError) as error:  # of the file, of JSON in it, of its rows, of JSON's depth
         raise _unreadable(path, error) from None
 
@@ -117,7 +124,7 @@ def worst(found: list[RunResult], count: int) -> list[RunResult]:
     """
     groups: dict[str, list[RunResult]] = defaultdict(list)
     for result in found:
-        if result.cause not in (SUCCESS, "error"):
+        if result.cause not in (SUCCESS, ERROR):
             groups[result.cause].append(result)
     order = sorted(groups.values(), key=lambda group: (-len(group), group[0].cause))
     for group in order:

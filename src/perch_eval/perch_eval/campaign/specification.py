@@ -12,7 +12,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ class Campaign:
         base: the scenario's mapping, before the variation.
         vary: varied name -> distribution.
         runs: runs to be flown.
-        digest: SHA-256 of everything that determines the results.
+        digest: SHA-256 of the settings: engine, runs, and the resolved files of scenario, vehicles and tag boards.
     """
 
     name: str
@@ -118,15 +118,18 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
         raise ConfigError(str(file), "runs", f"{flights} flights on all points of the grids are more than {RUNS_MAX}")
     drawn = _draw(vary, runs or content.runs, content.seed)
     axes = content.map or tuple(mappable[:2])
-    digest_input = json.dumps([engine, asdict(content.sensing), base, [[r.number, r.seed, r.values] for r in drawn]], sort_keys=True, default=str)
     campaign = Campaign(content.name, content.description, engine, content.sensing, axes if len(axes) == 2 else (),
-                        content.keep_worst, base, vary, drawn, hashlib.sha256(digest_input.encode()).hexdigest())
-    _check(campaign, str(file))
-    return campaign
+                        content.keep_worst, base, vary, drawn, "")
+    named = _check(campaign, str(file))
+    settings = json.dumps([engine, asdict(content.sensing), base, [[r.number, r.seed, r.values] for r in drawn], named], sort_keys=True, default=str)
+    return replace(campaign, digest=hashlib.sha256(settings.encode()).hexdigest())
 
 
-def _check(campaign: Campaign, file: str) -> None:
+def _check(campaign: Campaign, file: str) -> list[dict[str, Any]]:
     """Check that every run can be flown: its scenario, the files named there, and the nodes' parameters.
+
+    Returns:
+        The content of these vehicle and board files.
 
     Raises:
         ConfigError: a run cannot be flown; the message contains its number and values.
@@ -145,6 +148,7 @@ def _check(campaign: Campaign, file: str) -> None:
         if scenario.parameters != parameters:
             check_parameters(scenario, source)
             parameters = scenario.parameters
+    return [extended_mapping("vehicles", vehicle) | {"board": config.read_yaml(config.find("boards", board))} for vehicle, board, _ in vehicles]
 
 
 def set_value(mapping: dict[str, Any], name: str, value: Any) -> None:

@@ -6,14 +6,15 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
 from perch_core.errors import PerchError
 from perch_core.processes import end_with_parent, without_interrupts
+from perch_eval.campaign.causes import ERROR
 from perch_eval.campaign.engines import Task, run_task
 from perch_eval.campaign.results import RunResult
 from perch_eval.extras import require
@@ -53,54 +54,60 @@ def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int | None = 
                  ) -> Iterator[tuple[T, R]]:
     """Yield (item, result) of work in processes, in order of completion.
 
-    If a worker dies, the pool is broken: a new one is created, and unfinished items are repeated. Processes are spawned, not
-    forked: BLAS threads of the parent do not survive a fork. The processes end with the process that waits for them.
+    If a worker dies, the pool is broken, and any item that was in it may be the reason: each of them is repeated alone. Processes
+    are spawned, not forked: BLAS threads of the parent do not survive a fork. The processes end with the process that waits for them.
 
     Args:
         work: function to be called, defined at module level.
         items: its arguments.
         jobs: number of processes; None: one per core.
-        dead: returns the result of an item whose worker died `ATTEMPTS` times.
+        on_worker_death: returns the result of an item at which workers died `ATTEMPTS` times.
 
     Raises:
-        PerchError: a worker died `ATTEMPTS` times at an item, and there is no `dead`.
+        PerchError: workers died `ATTEMPTS` times at an item, and there is no `on_worker_death`.
     """
-    jobs = jobs or os.cpu_count() or 1
-    waiting, attempts = deque(enumerate(items)), Counter[int]()
+    waiting = deque(items)
     while waiting:
-        pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker)
-        pending: dict[Future[R], tuple[int, T]] = {}
-        try:
-            while waiting or pending:
-                while waiting and len(pending) < 2 * jobs:
-                    with without_interrupts():  # a worker that has just been started would print where it was
-                        pending[pool.submit(_call, work, waiting[0][1])] = waiting[0]  # raises where the pool has broken: it goes on waiting
-                    waiting.popleft()
-                for future in wait(pending, return_when=FIRST_COMPLETED).done:
-                    result = future.result()
-                    yield pending.pop(future)[1], result
-        except BrokenProcessPool:
-            for future, (number, item) in pending.items():
-                attempts[number] += 1
-                if future.done() and future.exception() is None:
-                    yield item, future.result()
-                elif attempts[number] < ATTEMPTS:
-                    waiting.append((number, item))
-                elif on_worker_death is None:
-                    raise PerchError(f"a process has died {ATTEMPTS} times at {item}") from None
-                else:
-                    yield item, on_worker_death(item)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():  # in the middle of what they do
-                process.terminate()
-            raise
-        pool.shutdown(wait=True, cancel_futures=True)
+        for suspect in (yield from _until_broken(work, waiting, jobs or os.cpu_count() or 1)):
+            alone = deque([suspect])
+            for _ in range(ATTEMPTS):
+                alone.extend((yield from _until_broken(work, alone, 1)))
+                if not alone:
+                    break
+            else:
+                if on_worker_death is None:
+                    raise PerchError(f"a process has died {ATTEMPTS} times at {suspect}")
+                yield suspect, on_worker_death(suspect)
+
+
+def _until_broken(work: Callable[[T], R], waiting: deque[T], jobs: int) -> Generator[tuple[T, R], None, list[T]]:
+    """Yield (item, result) of the waiting items until all are done or the pool breaks; return the unfinished items that were in it."""
+    pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare_worker)
+    pending: dict[Future[R], T] = {}
+    try:
+        while waiting or pending:
+            while waiting and len(pending) < 2 * jobs:
+                with without_interrupts():  # a worker that has just been started would print where it was
+                    pending[pool.submit(_call, work, waiting[0])] = waiting[0]  # raises where the pool has broken: it goes on waiting
+                waiting.popleft()
+            for future in wait(pending, return_when=FIRST_COMPLETED).done:
+                result = future.result()
+                yield pending.pop(future), result
+    except BrokenProcessPool:
+        finished = [future for future in pending if future.done() and future.exception() is None]
+        yield from [(pending.pop(future), future.result()) for future in finished]
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():  # in the middle of what they do
+            process.terminate()
+        raise
+    pool.shutdown(wait=True, cancel_futures=True)
+    return list(pending.values())
 
 
 def failed_run(task: Task, message: str = f"its worker died {ATTEMPTS} times") -> RunResult:
     """Return the result of a run whose workers died."""
-    return RunResult(task.run.number, task.run.seed, "error", "failed", message, task.run.values)
+    return RunResult(task.run.number, task.run.seed, ERROR, "failed", message, task.run.values)
 
 
 def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
