@@ -86,10 +86,22 @@ def test_a_page_is_marked_once_the_code_has_changed(tmp_path, monkeypatch):
 def test_results_are_of_the_code_whose_digest_they_have_whatever_was_committed_meanwhile(monkeypatch):
     monkeypatch.setattr(revision, "digest", lambda: "0123456789ab")
     text = revision.banner(["cde665f", "13d2870+", "cde665f"], ["0123456789ab"] * 3)
-    assert "> **Of commits 13d2870+, cde665f** (digest 0123456789ab)." in text and "git diff --stat 13d2870 -- src" in text
+    assert "> **Of commits 13d2870+, cde665f** (digest 0123456789ab)." in text
     for codes in (["0123456789ab", "ba9876543210"], [""], []):
         older = revision.banner(["cde665f"], codes)
         assert "Of commit cde665f, older than the code**." in older and not revision.out_of_date(older, "0123456789ab")
+
+
+@pytest.mark.skipif(not NOW, reason="not in a git repository")
+def test_the_changes_of_several_commits_are_since_the_oldest():
+    commits = subprocess.run(["git", "-C", str(revision.root()), "log", "--first-parent", "--format=%h", "--abbrev=7", "-20"],
+                             capture_output=True, text=True, check=True).stdout.split()
+    assert f"git diff --stat {commits[-1][:7]} -- src" in revision.banner(commits, [""])
+
+
+def test_code_is_of_unknown_version_without_git(monkeypatch):
+    monkeypatch.setenv("PATH", "/nonexistent")
+    assert revision.code_version() == {"commit": "unknown", "digest": ""}
 
 
 def test_the_front_page_shows_what_the_pages_of_results_say():

@@ -26,7 +26,11 @@ def root() -> Path:
 
 
 def _git(*arguments: str) -> str:
-    return subprocess.run(["git", "-C", str(root()), *arguments], capture_output=True, text=True, check=False).stdout.strip()
+    """Return what git prints; empty where it fails or is not installed."""
+    try:
+        return subprocess.run(["git", "-C", str(root()), *arguments], capture_output=True, text=True, check=False).stdout.strip()
+    except OSError:
+        return ""
 
 
 def commit() -> str:
@@ -60,7 +64,8 @@ def code_version() -> dict[str, str]:
 
 
 def banner(commits: Collection[str], codes: Collection[str]) -> str:
-    """Return the banner of a results page: its commits, whether they are older than the code, and how to list the changes.
+    """Return the banner of a results page: its commits, whether they are older than the code, and how to list the changes since
+    the oldest of them, or since where their histories part.
 
     Args:
         commits: from `commit()` when the results were made.
@@ -68,7 +73,8 @@ def banner(commits: Collection[str], codes: Collection[str]) -> str:
     """
     now, several = digest(), "s" * (len(set(commits)) > 1)
     status = f"** (digest {now})" if now and set(codes) == {now} else f"{OLDER}**"
-    first = min(commits, default="").partition("+")[0]
+    known = sorted({one.partition("+")[0] for one in commits})
+    first = _git("merge-base", "--octopus", *known)[:7] or next(iter(known), "")
     return f"> **Of commit{several} {', '.join(sorted(set(commits)))}{status}. What has changed since: `git diff --stat {first} -- {' '.join(CODE)}`"
 
 
