@@ -38,7 +38,9 @@ OBSERVATION_TIME = 6.0                    # after they have stopped [s]
 
 @dataclass(frozen=True)
 class Stop:
-    """Result of stopped commands; times are from the last command [s], nan: not before the next command or a touch.
+    """Result of stopped commands; times are from the last command [s].
+
+    inf: never; nan: not before the next command or a touch, or with the motors off before, which leaves it open.
 
     Attributes:
         tilt: of the body at the last command [deg].
@@ -101,14 +103,16 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
     t, tilt = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
     modes = [row[2] for row in rows]
 
+    missing = np.nan if touched or (gap or np.inf) < OBSERVATION_TIME else np.inf
+
     def first(which: set[Mode]) -> float:
-        return next((float(time) for time, mode in zip(t, modes) if mode in which), float("nan"))
+        return next((float(time) for time, mode in zip(t, modes) if mode in which), missing)
 
     above = np.flatnonzero(tilt > LEVEL)
     after = 0 if above.size == 0 else above[-1] + 1
     followed = [float(time) for time, mode in zip(t, modes) if mode is Mode.FOLLOWING]
     return Stop(tilt[0], tilt.max(), first({Mode.LEVEL, Mode.DESCENDING, Mode.DISARMED}),
-                float(t[after]) if after < len(t) and flying else float("nan"), first({Mode.DESCENDING, Mode.DISARMED}),
+                np.nan if not flying else float(t[after]) if after < len(t) else missing, first({Mode.DESCENDING, Mode.DISARMED}),
                 max(followed, default=0.0))
 
 
@@ -164,13 +168,13 @@ def figures(quick: bool) -> list[Figure]:
     flying = {key: one for key, one in found.items() if key[0] != "perched"}
     out.append(figure("last command held", "s", [one.held for one in flying.values()], 0.05, "max <="))
     long = [one for (_, gap, _), one in flying.items() if gap is None or gap > 0.3]
-    out.append(figure(f"level within {LEVEL:g} deg", "s", [one.levelled for one in long if np.isfinite(one.levelled)], 0.3, "max <="))
+    out.append(figure(f"level within {LEVEL:g} deg", "s", [one.levelled for one in long if not np.isnan(one.levelled)], 0.3, "max <="))
     for tilt, rate in TILTED:
         times = [levelled(vehicle, axis, tilt, rate)
                  for vehicle in (SCENARIO.vehicle, "rpg_betaflight") for axis in (AXES[1:2] if quick else AXES)]
         print(f"{tilt:g} deg, {rate:g} rad/s: level after", *(f"{time:.3f}" for time in times), "s", flush=True)
         out.append(figure(f"level within {LEVEL:g} deg, from {tilt:g} deg and {rate:g} rad/s", "s", times, 0.3, "max <="))
-    out.append(figure("descent or motors off", "s", [one.down for one in long if np.isfinite(one.down)], 1.0, "max <="))
+    out.append(figure("descent or motors off", "s", [one.down for one in long if not np.isnan(one.down)], 1.0, "max <="))
     out.append(figure("last command held by the firmware, link cut", "s", [held_without_link()], 0.05, "max <="))
     out.append(figure("pilot takes over", "s", [taken_over(at) for name, at in when.items() if name != "perched"], 0.05, "max <="))
     return out

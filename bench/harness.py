@@ -16,13 +16,12 @@ import operator
 import os
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from perch_core.processes import without_collector
-from perch_eval.revision import code_version
 
 _STATISTICS = {"median": lambda x: float(np.median(x)), "p99": lambda x: float(np.percentile(x, 99)),
                "max": lambda x: float(np.max(x)), "min": lambda x: float(np.min(x))}
@@ -100,9 +99,9 @@ def machine() -> dict[str, object]:
             "python": platform.python_version(), "numpy": np.__version__, "system": platform.platform()}
 
 
-def as_json(group_figures: dict[str, list[Figure]]) -> dict[str, object]:
-    """Return the figures in their common JSON form."""
-    return {**code_version(), "machine": machine(),
+def as_json(group_figures: dict[str, list[Figure]], code: Mapping[str, str]) -> dict[str, object]:
+    """Return the figures in their common JSON form; `code`: from `code_version()` before they were measured."""
+    return {**code, "machine": machine(),
             "figures": [{"group": group, **asdict(item)} for group, items in group_figures.items() for item in items]}
 
 

@@ -55,7 +55,7 @@ def main() -> int:
     arguments = parser.parse_args()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
-    vehicle, settings = load_vehicle("snapdragon"), shipped_settings()
+    code, vehicle, settings = code_version(), load_vehicle("snapdragon"), shipped_settings()
     codes, broken, unconfirmed, exceptions, times, durations, done = Counter(), [], [], [], [], [], 0
     begin = time.time()
     try:
@@ -83,7 +83,7 @@ def main() -> int:
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
     ms = 1e3 * np.array(times or [np.nan])
-    result = {**code_version(), "machine": machine(), "command": shlex.join(["python3", *sys.argv]),
+    result = {**code, "machine": machine(), "command": shlex.join(["python3", *sys.argv]),
               "problems": done, "first_seed": arguments.first, "plans": len(times), "refusals": dict(codes),
               "findings_of_the_verifier": broken, "unconfirmed_refusals": unconfirmed, "exceptions": exceptions,
               "plan_ms": {"median": float(np.median(ms)), "p90": float(np.percentile(ms, 90)), "max": float(ms.max())},

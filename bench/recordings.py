@@ -23,7 +23,7 @@ import recordings_scores as scores
 from perch_core.json_values import finite, write_json
 from perch_core.processes import single_threaded_blas
 from perch_eval.evaluation.document import machine, table
-from perch_eval.revision import banner, code_version, commit, digest, root
+from perch_eval.revision import banner, code_version, root
 from recordings_scores import Figures
 
 
@@ -207,8 +207,8 @@ def judged(f: Figures) -> str:
     return f"{f['arcs']} arcs in {f['photographs']} photographs, {f['arcs'] - f['wires']} of them not on wires, by eye"
 
 
-def page(results: Mapping[str, Figures], command: str) -> list[str]:
-    """Lines of README.md; `results`: figures by key of the recording."""
+def page(results: Mapping[str, Figures], command: str, code: Mapping[str, str]) -> list[str]:
+    """Lines of README.md; `results`: figures by key of the recording; `code`: commit and digest of their code."""
     def row(key: str, text: Callable[[Figures], str], what: str = "") -> list[str]:
         return [RECORDINGS[key].title + what, text(results[key]) if key in results else MISSING]
 
@@ -219,7 +219,7 @@ def page(results: Mapping[str, Figures], command: str) -> list[str]:
     def arcs(key: str) -> list[str]:
         return row(key, lambda f: f"{f['ours']['arcs']} arcs in {f['ours']['photographs']} photographs", ", without wires")
 
-    lines = ["# Perception on recordings", "", banner([commit()], [digest()]), "", f"Made by `{command}` on {machine()}. This page is generated.",
+    lines = ["# Perception on recordings", "", banner([code["commit"]], [code["digest"]]), "", f"Made by `{command}` on {machine()}. This page is generated.",
              INTRODUCTION, *table("recording | what it is | source | licence", (
                  (r.title, r.about, ", ".join(f"`{p}`" for p in r.paths) or "this repository", r.licence) for r in RECORDINGS.values())),
              ODOMETRY, *table("recording | compared | ATE | at the end | attitude | NEES per dimension | restarts", (
@@ -263,8 +263,9 @@ def main() -> int:
     data = arguments.out / "results.json"
     before = json.loads(data.read_text()) if arguments.only and data.is_file() else {}
     made_by = "python3 bench/recordings.py FOLDER"
-    head = {**code_version(), "command": made_by, "machine": machine()}
-    results: dict[str, Figures] = before["recordings"] if before.get("digest") == head["digest"] else {}
+    code = code_version()
+    head = {**code, "command": made_by, "machine": machine()}
+    results: dict[str, Figures] = before["recordings"] if before.get("digest") == code["digest"] != "" else {}
     for key, recording in RECORDINGS.items():
         if arguments.only not in (None, key):
             continue
@@ -278,7 +279,7 @@ def main() -> int:
             results[key] = finite(recording.score(*places))
             print(f"{key}: {json.dumps(results[key])}", flush=True)
         write_json(data, {**head, "recordings": results})
-    (arguments.out / "README.md").write_text("\n".join(page(results, made_by)) + "\n")
+    (arguments.out / "README.md").write_text("\n".join(page(results, made_by, code)) + "\n")
     return 0
 
 

@@ -40,7 +40,9 @@ def main() -> int:
     sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "oracles")]  # the closed loop and the oracles of the tests
     import harness
     from perch_core.json_values import write_json
+    from perch_eval.revision import code_version
 
+    code = code_version() if arguments.json else {}
     results, failed = {}, False
     for group in [arguments.group] if arguments.group else GROUPS:
         print(f"== {group}", flush=True)
@@ -53,7 +55,7 @@ def main() -> int:
         print(harness.table(results[group]), flush=True)
         failed |= any(item.holds is False for item in results[group])
     if arguments.json:
-        write_json(arguments.json, harness.as_json(results))
+        write_json(arguments.json, harness.as_json(results, code))
     return 1 if failed else 0
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import math
 import os
 import subprocess
 import sys
@@ -11,6 +13,7 @@ from types import SimpleNamespace
 
 import harness
 import machine
+import numpy as np
 import pytest
 
 
@@ -39,11 +42,36 @@ def test_measure_counts_only_after_the_warm_up():
 
 def test_json_and_table_name_every_figure():
     items = [harness.figure("plan", "ms", [0.3], bar=0.5), harness.figure("import", "s", [1.0])]
-    written = harness.as_json({"planner": items})
-    assert written["machine"]["cores"] >= 1 and {"commit", "digest"} <= set(written)
+    written = harness.as_json({"planner": items}, {"commit": "1234567", "digest": "0123456789ab"})
+    assert written["machine"]["cores"] >= 1 and (written["commit"], written["digest"]) == ("1234567", "0123456789ab")
     assert [f["name"] for f in written["figures"]] == ["plan", "import"]
     assert {"name", "unit", "median", "p99", "n", "bar", "holds"} <= set(written["figures"][0])
     assert "holds" in harness.table(items) and "import" in harness.table(items)
+
+
+@pytest.mark.parametrize("gap, touch, missing", [(None, False, math.inf), (10.0, False, math.inf), (0.5, False, math.nan), (None, True, math.nan)])
+def test_a_vehicle_that_never_levels_fails_the_bar(monkeypatch, gap, touch, missing):
+    """Unless the commands went on, or a touch ended it, before it could."""
+    autopilot = importlib.import_module("autopilot")
+    touched, tilted = [], np.array([0.5, 0.0, 0.0, 0.866])
+    body = SimpleNamespace(plant=SimpleNamespace(rotor_speed=np.ones(4)), state=SimpleNamespace(q_WB=tilted))
+    loop = SimpleNamespace(time=0.0, close=lambda: None, vehicle=SimpleNamespace(simulation=body))
+
+    def step():
+        loop.time += 0.1
+        touched.extend([loop.time] if touch and loop.time > 2.0 else [])
+
+    loop.step = step
+    link = SimpleNamespace(kill=lambda: None, last_command=1.0, watchdog=SimpleNamespace(mode=autopilot.Mode.FOLLOWING))
+    monkeypatch.setattr(autopilot, "start_flight", lambda: (loop, link, touched))
+    found = autopilot.stopped(1.0, gap)
+    assert found.levelled == found.down == missing or math.isnan(found.levelled) and math.isnan(missing)
+    for name, value in (("stopped", lambda *_: found), ("phase_times", lambda: {"hover": 1.0}), ("levelled", lambda *_: 0.1),
+                        ("held_without_link", lambda: 0.01), ("taken_over", lambda _: 0.01)):
+        monkeypatch.setattr(autopilot, name, value)
+    if missing == math.inf:
+        judged = {one.name: one.holds for one in autopilot.figures(True)}
+        assert judged["level within 10 deg"] is judged["descent or motors off"] is False
 
 
 def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):
