@@ -10,6 +10,7 @@ import sys
 import time
 from collections import Counter
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +24,7 @@ from perch_eval.graph_faults.relay_node import DELAY, Disturbance
 from perch_eval.fork_server import alive, session, start
 
 CASE = Case("kill", "estimator", "climb", LOCKSTEP)
+CODE = {"commit": "1234567", "digest": "now"}
 
 
 def test_every_node_is_struck_by_every_fault_in_every_phase_and_mode():
@@ -103,7 +105,7 @@ def test_a_killed_campaign_keeps_what_was_flown(tmp_path, monkeypatch):
     file.write_text(json.dumps(row()) + "\n" + json.dumps(row(node="mission"))[:50])
     assert list(campaign.load(file)) == [CASE]
     flown = []
-    monkeypatch.setattr(campaign, "digest", lambda: "now")
+    monkeypatch.setattr(campaign, "code_version", lambda: CODE)
     monkeypatch.setattr(campaign, "fly_all", lambda missing, *_: flown.extend(missing))
     assert campaign.main(["--out", str(tmp_path), "--logs", str(tmp_path), "--only", "kill estimator climb"]) == 0
     assert flown == [CASE._replace(mode=REAL_TIME)]
@@ -118,9 +120,24 @@ def test_flights_in_real_time_have_the_machine_to_themselves(tmp_path, monkeypat
         yield from ((case, row(mode=case.mode)) for case in missing)
 
     monkeypatch.setattr(campaign, "in_processes", in_order)
-    campaign.fly_all(campaign.cases()[:40], tmp_path / campaign.ROWS, tmp_path, {}, 3)
+    campaign.fly_all(campaign.cases()[:40], tmp_path / campaign.ROWS, tmp_path, {}, 3, CODE)
     assert [(jobs, modes) for jobs, modes, _ in flown] == [(3, {campaign.LOCKSTEP}), (1, {REAL_TIME})]
     assert sum(number for *_, number in flown) == 40
+
+
+def test_a_case_that_could_not_be_flown_is_a_failure_and_the_others_have_their_rows(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(campaign, "code_version", lambda: CODE)
+    monkeypatch.setattr(campaign, "in_processes", lambda work, missing, jobs: ((case, row(mode=case.mode, code="now") if case.mode == REAL_TIME
+                                                                               else "not flown: not ready: vehicle") for case in missing))
+    command = ["--out", str(tmp_path), "--logs", str(tmp_path), "--only", "kill estimator climb"]
+    assert campaign.main(command) == 1 and "not ready: vehicle" in capsys.readouterr().err
+    assert list(campaign.load(tmp_path / campaign.ROWS, "now")) == [CASE._replace(mode=REAL_TIME)]
+
+
+def test_rows_are_of_the_code_at_the_start_of_the_campaign(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign, "fly", lambda case, folder, commit: Flown(commit))
+    monkeypatch.setattr("perch_eval.revision.digest", lambda: "later")
+    assert campaign._fly(tmp_path, CODE, CASE) == {"commit": "1234567", "code": "now"}
 
 
 def test_rows_of_other_code_are_flown_again_and_dropped(tmp_path, monkeypatch):
@@ -128,7 +145,7 @@ def test_rows_of_other_code_are_flown_again_and_dropped(tmp_path, monkeypatch):
     file.write_text(json.dumps(row(code="before")) + "\n" + json.dumps(row(node="mission")) + "\n")
     kept = campaign.load(file, "now")
     assert set(campaign.load(file)) == {CASE, other} and list(kept) == [other]
-    campaign.fly_all([], file, tmp_path, kept, 1)
+    campaign.fly_all([], file, tmp_path, kept, 1, CODE)
     assert list(campaign.load(file)) == [other]
 
 
@@ -176,6 +193,11 @@ def test_processes_of_a_fork_server_end_with_a_caller_that_is_killed(tmp_path, m
     until(lambda: not begun or log.exists() and log.read_text())
     caller.kill(), caller.wait()
     until(lambda: not alive(pid))
+
+
+@dataclass(frozen=True)
+class Flown:
+    commit: str
 
 
 def until(done, patience=120.0):

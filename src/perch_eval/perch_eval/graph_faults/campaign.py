@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from functools import partial
@@ -20,7 +20,7 @@ from perch_eval.campaign.workers import in_processes
 from perch_eval.evaluation.document import machine, table
 from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, PHASES, REAL_TIME, REPORT_LIMIT, SAFE, TRAFFIC, Case, cases
 from perch_eval.graph_faults.flight import fly
-from perch_eval.revision import banner, commit, digest
+from perch_eval.revision import banner, code_version
 from perch_eval.rows import Rows, rows_of
 
 EXAMPLES = """examples:
@@ -32,7 +32,7 @@ EXAMPLES = """examples:
   python3 scripts/faults.py --again --only "stop controller"   fly them once more
   python3 scripts/faults.py --page                             write the page of what has been flown
 
-exit code: 0 every flight ended safely and its fault was named, 1 otherwise, 2 invalid input, 130 interrupted"""
+exit code: 0 every flight was flown, ended safely and its fault was named, 1 otherwise, 2 invalid input, 130 interrupted"""
 ROWS = "rows.jsonl"
 FALL_SPEED = 1.5  # of an impact on the floor that counts as a fall [m/s]
 
@@ -55,15 +55,15 @@ def _run(args: argparse.Namespace) -> int:
     chosen = [case for case in cases() if all(word in case.name for word in args.only.split())]
     if not chosen:
         raise PerchError(f"--only {args.only}: no case has these words in its name")
-    rows = load(args.out / ROWS, None if args.page else digest())
+    code = code_version()
+    rows = load(args.out / ROWS, None if args.page else code["digest"])
     missing = [] if args.page else [case for case in chosen if args.again or case not in rows][:args.most]
-    if missing:
-        fly_all(missing, args.out / ROWS, args.logs, rows, args.jobs)
+    not_flown = fly_all(missing, args.out / ROWS, args.logs, rows, args.jobs, code) if missing else 0
     known = [rows[case] for case in cases() if case in rows]
     (args.out / "README.md").write_text(page(known))
     bad = [row for row in known if problems(row)]
     print(f"{args.out / 'README.md'}: {len(known)} of {len(cases())} flown, {len(known) - len(bad)} good")
-    return 1 if bad else 0
+    return 1 if bad or not_flown else 0
 
 
 def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
@@ -80,32 +80,39 @@ def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
     return found
 
 
-def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, dict[str, Any]], jobs: int) -> None:
+def fly_all(missing: Sequence[Case], file: Path, logs: Path, rows: dict[Case, dict[str, Any]], jobs: int,
+            code: Mapping[str, str]) -> int:
     """Fly cases: `jobs` at a time in lockstep, then one by one in real time, as parallel real-time flights lack processor time.
-    Each row is written when its flight has ended.
+    Each row is written when its flight has ended, with the commit and digest of `code`.
+
+    Returns:
+        The number of cases that could not be flown.
 
     Raises:
         PerchError: the process of a flight died repeatedly.
     """
+    not_flown = 0
     with closing(Rows(file, rows.values())) as kept, closing(Progress(len(missing), unit="flights")) as progress:
         for mode, at_once in ((LOCKSTEP, jobs), (REAL_TIME, 1)):
-            for case, row in in_processes(partial(_fly, logs), [case for case in missing if case.mode == mode], at_once):
+            for case, row in in_processes(partial(_fly, logs, code), [case for case in missing if case.mode == mode], at_once):
                 if isinstance(row, dict):
                     rows[case] = row
                     kept.add(row)
                     progress.add(not problems(row))
+                else:
+                    not_flown += 1
                 if words := [row] if isinstance(row, str) else problems(row):
                     print(f"\n{case.name}: {'; '.join(words)}", file=sys.stderr, flush=True)
+    return not_flown
 
 
-def _fly(logs: Path, case: Case) -> dict[str, Any] | str:
+def _fly(logs: Path, code: Mapping[str, str], case: Case) -> dict[str, Any] | str:
     """Fly a case; return its row, or the reason why it was not flown."""
     folder = logs / case.name.replace(", ", "_").replace(" ", "_")
     for old in folder.glob("*.log"):
         old.unlink()
-    code = digest()
     try:
-        return {**asdict(fly(case, folder, commit())), "code": code}
+        return {**asdict(fly(case, folder, code["commit"])), "code": code["digest"]}
     except PerchError as error:
         return f"not flown: {error}"
 
