@@ -68,6 +68,15 @@ def test_figures_are_of_the_attempt_that_touched_and_of_what_is_known():
     assert found["estimation_judged"] == pytest.approx(1.5 / 1.9, abs=2e-3) and found["tracking_judged"] == pytest.approx(1.5 / 1.9, abs=2e-3)
 
 
+def test_the_target_is_judged_as_it_was_when_the_plan_was_requested():
+    """A tenth of a second before the plan's start at 1.5 s; what is seen after that cannot have been planned on."""
+    channels = flown()
+    [(t, pose)] = channels["target/pose"]
+    seen = [pose._replace(stamp=round(1e9 * time), p_WS=pose.p_WS + (0.0, error, 0.0)) for time, error in ((1.2, 0.5), (1.39, 0.01), (1.41, 0.3))]
+    channels["target/pose"] = timed(seen)
+    assert flight_metrics(Flight(channels), 4.0)["target_error"]["position_m"] == pytest.approx(0.05)
+
+
 def test_rates_without_a_perch_are_not_compared_with_those_of_a_perch(recorded):
     found = flight_metrics(recorded[1], 4.0)
     assert "max_body_rate_deg_s" in figures(found, 4.0) and "max_acceleration_m_s2" in figures(found, 4.0)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from perch_control.mission.settings import MissionSettings
 from perch_core import so3
 from perch_core.values import AtEnd, Contact, seconds
 from perch_core.vehicle import Vehicle
@@ -26,6 +27,8 @@ FIGURES: dict[str, tuple[str, str, float]] = {
     "target_error_position_m": ("target error, position", "cm", 100.0), "target_error_attitude_deg": ("target error, attitude", "deg", 1.0),
 }
 """Name of a figure, as in `figures` -> title, display unit, factor to that unit."""
+MISSION = MissionSettings()
+"""Settings of the mission from which the time of a plan's request is known, as shipped."""
 DURATION = re.compile(r"_(ms|us)(?=_|$)")
 """Unit in the names of diagnostics that are durations."""
 
@@ -142,12 +145,15 @@ def figures(report: dict[str, Any], end_time: float) -> dict[str, float | None]:
 
 
 def target_error(flight: Flight) -> dict[str, float] | None:
-    """Return the error, in map, of the target pose on which the first perch was planned; None if not available."""
+    """Return the error, in map, of the target pose on which the first perch was planned; None if not available.
+
+    It is the newest one when the plan was requested, `mission.plan_lead` before its start.
+    """
     true, found = flight.values("ground_truth/target"), flight.values("target/pose")
     plans = [t for t, order in flight.values("trajectory") if order.at_end == AtEnd.CONTACT]
     if not true or not found or not plans:
         return None
-    used = [pose for t, pose in found if t <= plans[0]] or [found[0][1]]
+    used = [pose for t, pose in found if t <= plans[0] - MISSION.lead(MISSION.planner_latency)] or [found[0][1]]
     pose = used[-1]
     pad = min(true, key=lambda sent: abs(sent[0] - seconds(pose.stamp)))[1]  # it may move
     dp = np.array(pose.p_WS) - np.array(pad.p)
