@@ -42,6 +42,14 @@ def test_a_whole_state_takes_the_place_of_what_was_believed():
     np.testing.assert_allclose(flight.estimator.estimate.P, pose.inertial.P, rtol=1e-6, atol=1e-11)
 
 
+def test_the_dimension_of_an_innovation_is_known():
+    """The pose alone, or with the velocity."""
+    flight = Flight(5, latency=0.0).fly(end=1000)
+    assert flight.estimator.status.nis_dimension == 6
+    flight.estimator.add_vio(whole_state(flight, 999, np.random.default_rng(4), 1e-3)[0])
+    assert flight.estimator.status.nis_dimension == 9
+
+
 def test_a_state_that_is_late_is_replayed_to_now():
     """The same state, 40 ms late: what it becomes by the same samples."""
     rng = np.random.default_rng(4)

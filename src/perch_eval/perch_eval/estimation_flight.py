@@ -224,14 +224,14 @@ class _Estimator(StateEstimator):
         super().__init__(UkfConfig())  # type: ignore[arg-type]  # the name of the estimator is nothing to itself
         self._from, self._samples = round(begin * 1e9), 0
         self.states: list[tuple[int, Estimate]] = []  # number of the sample
-        self.nis: list[float] = []
+        self.nis: list[tuple[float, int]] = []  # and its dimension
 
     def on_imu(self, sample: ImuSample) -> None:
         """Process a sample as the base class does; record NIS and state."""
         accepted = self._estimator.status.accepted
         super().on_imu(sample)
         if self._estimator.status.accepted > accepted:
-            self.nis.append(self._estimator.status.nis)
+            self.nis.append((self._estimator.status.nis, self._estimator.status.nis_dimension))
         if sample.stamp >= self._from and self._samples % STRIDE == 0:
             assert self._estimator.estimate is not None
             self.states.append((self._samples, self._estimator.estimate))
@@ -278,7 +278,7 @@ class EstimatorTrack:
         times: [s], shape (n,).
         errors: truth minus estimate of (p, v, theta, b_g, b_a), shape (n, 15).
         covariances: shape (n, 15, 15).
-        nis: of each VIO state that was used.
+        nis: of each of the m VIO states that were used, and its dimension, shape (m, 2).
         health: the estimator's health messages, ten per second.
     """
 
@@ -300,7 +300,7 @@ def run_estimator(flight: Flight, steps: list[VioStep], latency: float = 0.040, 
     errors = [np.concatenate([truth.p_WB[k] - e.p_WB, truth.v_WB[k] - e.v_WB, attitude_error(q[k], e.q_WB),
                               readings.gyro_bias[k] - e.gyro_bias, readings.accel_bias[k] - e.accel_bias]) for k, e in estimator.states]
     return EstimatorTrack(np.array([truth.times[k] for k, _ in estimator.states]), np.array(errors),
-                          np.array([e.P for _, e in estimator.states]), np.array(estimator.nis),
+                          np.array([e.P for _, e in estimator.states]), np.array(estimator.nis, float).reshape(-1, 2),
                           tuple(loop.trace.values("estimator/status")))
 
 

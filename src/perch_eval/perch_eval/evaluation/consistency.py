@@ -68,7 +68,8 @@ def consistency_sections(effort: Effort) -> list[Section]:
         out.data[r.name] = {"inside": r.inside, "above": r.above, "mean_over_dimension": float(r.mean.mean() / r.dimension), "bounds": r.bounds}
     rmse = 100 * np.array([np.sqrt((one.track.errors[one.track.times >= motion.perch_time, :3] ** 2).mean(axis=0)) for one in flown])
     out.show("RMSE of x, y, z through the perch", ", ".join(f"{x:.2f}" for x in np.median(rmse, axis=0)) + " cm", note="median")
-    out.show("NIS of the estimator over 6", f"{np.concatenate([one.track.nis for one in flown]).mean() / 6:.2f}")
+    nis, dimension = np.concatenate([one.track.nis for one in flown]).sum(axis=0)
+    out.show("NIS of the estimator over its dimension", f"{nis / dimension:.2f}")
     out.show("NIS of VIO over its dimension", f"{np.mean([one.vio_nis for one in flown]):.2f}")
     consistency.plot(results, effort.out / "consistency.png", {"take-off": 1.0, "hover": 3.0, "perch": 4.5})
     out.figures.append(("consistency.png", "NEES, mean over the runs, with its expectation and its 95 % bounds"))

@@ -53,7 +53,7 @@ class Estimator:
         self._waiting: list[VioPose] = []
         self._refused_in_row = 0
         self._accepted = self._rejected = self._divergences = 0
-        self._nis = 0.0
+        self._nis, self._nis_dimension = 0.0, 0
         self._diverged = False
         self._message = "waiting for the IMU"
         self._compile()
@@ -122,7 +122,8 @@ class Estimator:
             attitude = float(np.sqrt(diagonal[at.D_ATTITUDE].max()))
             lost = position > _LOST_POSITION or attitude > _LOST_ATTITUDE
             health = Health.DIVERGED if lost else Health.COASTING if age > self.config.coasting_after else Health.RUNNING
-        return Status(health, age, self._accepted, self._rejected, self._divergences, self._nis, position, attitude, self._message)
+        return Status(health, age, self._accepted, self._rejected, self._divergences, self._nis, self._nis_dimension, position, attitude,
+                      self._message)
 
     def _compile(self) -> None:
         """Run the compiled functions once: their first compilation takes seconds, which must not happen in flight."""
@@ -165,8 +166,8 @@ class Estimator:
         anchor = next(a for a in reversed(self._anchors) if a.stamp <= pose.stamp)
         prior = self._transform.predict(anchor, self._imu.run(anchor.stamp, pose.stamp), pose.stamp)
         innovation, outcome = self._innovate(prior, pose), VioOutcome.APPLIED
-        self._nis = innovation.nis
-        if innovation.nis > GATES[len(innovation.residual)]:
+        self._nis, self._nis_dimension = innovation.nis, len(innovation.residual)
+        if innovation.nis > GATES[self._nis_dimension]:
             self._refused_in_row += 1
             if self._refused_in_row < _MAX_CONSECUTIVE_REJECTIONS:
                 return VioOutcome.GATED

@@ -135,7 +135,7 @@ class Status:
         vio_age: time since the stamp of the last applied VIO pose [s]; inf without an estimate.
         accepted, rejected: numbers of VIO poses applied and gated.
         broken: number of divergences: covariance not positive definite, or state not finite; each causes a restart.
-        nis: normalised innovation squared of the last pose that reached the gate.
+        nis, nis_dimension: normalised innovation squared of the last pose that reached the gate, and its dimension.
         position_sigma, attitude_sigma: largest 1 sigma [m], [rad]; inf without an estimate.
         message: human-readable last event.
     """
@@ -146,6 +146,7 @@ class Status:
     rejected: int
     broken: int
     nis: float
+    nis_dimension: int
     position_sigma: float
     attitude_sigma: float
     message: str
