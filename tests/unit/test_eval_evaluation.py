@@ -1,14 +1,21 @@
 """The evaluation: verdicts, exit codes, the cable's exact figures, and the nonlinear comparison."""
 
+import fcntl
 import json
 import math
+import os
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from perch_core import bernstein
 from perch_core.vehicle import GRAVITY, load_vehicle
-from perch_eval.evaluation import command, control
+from perch_eval.campaign.engines import Task
+from perch_eval.campaign.results import RunResult
+from perch_eval.campaign.specification import Run
+from perch_eval.evaluation import command, control, kept
 from perch_eval.evaluation.cable import cable_of_length
 from perch_eval.evaluation.nonlinear import solve
 from perch_eval.evaluation.planning_times import SETTINGS, waypoint_problem
@@ -33,6 +40,97 @@ def part(*claims, missing=False):
 
 def broken(effort):
     raise RuntimeError("no fuel")
+
+
+def asserts(effort):
+    raise AssertionError
+
+
+@pytest.fixture
+def parts(monkeypatch, tmp_path):
+    """Sets the parts of the evaluation; in an empty folder, outside a repository's digest, which takes time."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("perch_eval.revision.commit", lambda: "1234567")
+    monkeypatch.setattr("perch_eval.revision.digest", lambda: "0123456789ab")
+
+    def set_parts(**parts):
+        monkeypatch.setattr(command, "PARTS", {name: name for name in parts})
+        monkeypatch.setattr(command, "resolved", lambda place: parts[place.rpartition(".")[2]])
+
+    return set_parts
+
+
+def test_a_part_that_fails_in_any_way_is_a_row_and_the_others_go_on(parts):
+    parts(a=asserts, b=part(True))
+    first, second = command.evaluate(None, ["a", "b"])
+    assert [row.verdict for row in first.rows] == ["not available"] and second.rows[0].verdict == "holds"
+
+
+def flying(flown):
+    """A part with two flights."""
+    def make(effort):
+        def pool(work, jobs, processes, dead):
+            flown.extend(jobs)
+            yield from ((job, {"x": 1}) for job in jobs)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(kept, "in_processes", pool)
+            kept.cached_figures(effort, "shared", [1, 2], None, lambda row: True)
+        return []
+
+    return make
+
+
+def test_flights_that_parts_share_are_flown_once_and_again_when_asked_for(parts):
+    flown = []
+    parts(a=flying(flown), b=flying(flown))
+    for arguments, flights in (([], 2), ([], 2), (["--fresh"], 4), ([], 4)):
+        assert command.main(arguments + ["--out", "results"]) == 0 and len(flown) == flights
+
+
+def test_flights_of_unknown_code_are_not_reused(tmp_path):
+    flown = []
+    effort = Effort(True, 1, tmp_path, tmp_path, "", range(1), range(1), 1, {"commit": "unknown", "digest": ""})
+    flying(flown)(effort), flying(flown)(effort)
+    assert flown == [1, 2, 1, 2]
+
+
+def test_flights_that_could_not_be_carried_out_are_flown_again(tmp_path, monkeypatch):
+    flown, cause = [], "error"
+
+    def pool(work, tasks, processes, dead):
+        for task in tasks:
+            flown.append(task.run.number)
+            yield task, asdict(RunResult(task.run.number, 1, cause if task.run.number else "perched", "", ""))
+
+    monkeypatch.setattr(kept, "in_processes", pool)
+    effort = Effort(True, 1, tmp_path, tmp_path, "", range(1), range(1), 1, {"commit": "1234567", "digest": "0123456789ab"})
+    tasks = [Task(Run(k, 1, {}), {}, "in_process", None) for k in range(2)]
+    kept.cached_runs(effort, "flights", tasks)
+    cause = "perched"
+    assert [r.cause for r in kept.cached_runs(effort, "flights", tasks)] == ["perched"] * 2 and flown == [0, 1, 1]
+
+
+def test_a_page_is_of_the_code_with_which_its_flights_began(parts, monkeypatch):
+    def edited(effort):
+        monkeypatch.setattr("perch_eval.revision.digest", lambda: "ba9876543210")
+        return []
+
+    parts(a=edited)
+    assert command.main(["--out", "results"]) == 0
+    assert "> **Of commit 1234567, older than the code**" in Path("results/README.md").read_text()
+    assert json.loads(Path("results/results.json").read_text())["digest"] == "0123456789ab"
+
+
+def test_two_evaluations_at_once_would_lose_flights_and_are_refused(parts, capsys):
+    parts(a=part(True))
+    Path("out/evaluation/quick").mkdir(parents=True)
+    lock = os.open("out/evaluation/quick", os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert command.main(["--out", "results"]) == 2 and "out/evaluation/quick: another run is writing there" in capsys.readouterr().err
+    finally:
+        os.close(lock)
 
 
 @pytest.mark.slow
@@ -115,5 +213,5 @@ def test_a_comparison_with_a_flight_that_was_not_begun_is_written(tmp_path, monk
         return flown
 
     monkeypatch.setattr(control, "cached_figures", known)
-    sections = control.comparison_sections(Effort(True, 1, tmp_path, tmp_path, "test", False, range(1, 2), range(1, 2), 1))
+    sections = control.comparison_sections(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1))
     assert len(sections) == 1 and "not begun: refused" in (tmp_path / "comparison.md").read_text()

@@ -1,6 +1,5 @@
 """Errors at the perching point of a flown powerline perch, against a flight whose errors are known."""
 
-import dataclasses
 from dataclasses import asdict
 
 import numpy as np
@@ -78,7 +77,8 @@ def test_the_map_is_judged_in_map_and_as_the_vehicle_sees_it():
     flight, where = Flown(12.8), scenario()
     _, y, z = where.mission.perch_point
     lines = tuple(MappedPowerline(1, (-1.0, k, z + k), (5.0, k, z + k), 0.01, np.zeros((3, 3)), 0.0, 1) for k in (0.03, 1.0))
-    flight.made["powerlines"] = [(8.9, PowerlineMap(nanoseconds(10.5), lines, False, ""))]
+    flight.made["powerlines"] = [(7.9, PowerlineMap(nanoseconds(10.5), lines, False, "")),
+                                 (8.9, PowerlineMap(nanoseconds(10.5), lines[1:], False, ""))]  # after the request, 1.04 s before the start
     found = mapping_errors(flight, where)
     assert found["mapping_in_map_m"] == pytest.approx(np.hypot(0.03, 0.03), abs=1e-6)
     drift = np.array([0.0, 0.04, 0.02])
@@ -97,7 +97,8 @@ def test_a_crash_on_the_way_is_no_error_at_the_perch():
 
 
 def effort(tmp_path, seeds: int) -> Effort:
-    return Effort(True, 1, tmp_path, tmp_path, "evaluate.py", False, seeds=range(1, 2), seeds_on_lines=range(1, 1 + seeds), layouts=1)
+    return Effort(True, 1, tmp_path, tmp_path, "evaluate.py", seeds=range(1, 2), seeds_on_lines=range(1, 1 + seeds), layouts=1,
+                  code={"commit": "1234567", "digest": "0123456789ab"})
 
 
 def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_when_seeds_are_added(tmp_path, monkeypatch):
@@ -109,7 +110,6 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
             yield task, asdict(RunResult(task.run.number, task.run.seed, "perched", "perched", "", task.run.values))
 
     monkeypatch.setattr(kept, "in_processes", pool)
-    monkeypatch.setattr(kept, "digest", lambda: "0123456789ab")
     found = powerline_flights.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"))
     assert {key: [r.seed for r in runs] for key, runs in found.items()} == {
         ("line_80_pa", True): [1, 2], ("line_80_pa", False): [], ("line_180", True): [1, 2], ("line_180", False): [1, 2]}
@@ -117,8 +117,6 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
     found = powerline_flights.flights(effort(tmp_path, 5), ("line_80_pa", "line_180"))
     assert [r.seed for r in found["line_180", False]] == [1, 2, 3] and [r.seed for r in found["line_180", True]] == [1, 2, 3, 4, 5]
     assert len(handed) == len({task.run.number for task in handed}) == 13, "nothing is flown twice"
-    powerline_flights.flights(dataclasses.replace(effort(tmp_path, 1), fresh=True), ("line_80_pa", "line_180"))
-    assert len(handed) == 16, "unless it is asked for"
 
 
 @pytest.mark.parametrize("outcome, message, verdict", [("missed", "no adhesion; recovered to a hover", HOLDS),
@@ -137,3 +135,14 @@ def test_a_flight_without_a_grip_must_end_in_a_hover(tmp_path, monkeypatch, outc
     assert rows["180 deg: recoveries to a hover"].verdict == VACUOUS, "all gripped"
     assert rows["180 deg: gripped the cable"].ours.startswith("1/1")
     assert "80 deg, perception-aware, grip switched off: recoveries to a hover" not in rows
+
+
+def test_errors_of_flights_that_never_came_to_the_line_fail(tmp_path, monkeypatch):
+    def pool(work, tasks, jobs, dead):
+        yield from ((task, asdict(RunResult(task.run.number, task.run.seed, "not_found", "not_found", "no map", task.run.values))) for task in tasks)
+
+    monkeypatch.setattr(kept, "in_processes", pool)
+    [section] = flown_sections(effort(tmp_path, 2))
+    rows = {row.name: row for row in section.rows}
+    for name in ("80 deg: position RMSE", "80 deg: pitch-roll RMSE", "80 deg: mapping"):
+        assert rows[name].verdict == FAILS and "(0 of 2 flights)" in rows[name].ours

@@ -7,7 +7,8 @@ import pytest
 
 from perch_core import so3
 from perch_core.vehicle import load_vehicle
-from perch_eval.evaluation import control, inspection, ways_out
+from perch_eval.campaign.results import RunResult
+from perch_eval.evaluation import control, inspection, perching, ways_out
 from perch_eval.evaluation.sections import Effort
 from perch_eval.inspection.measures import inspection_result, judge, reference_states, segments, watched
 from perch_sim.scenario import load_scenario
@@ -15,7 +16,7 @@ from perch_sim.scenario import load_scenario
 
 @pytest.fixture
 def effort(tmp_path):
-    return Effort(True, 1, tmp_path, tmp_path / "state", "x", False, range(1, 6), range(1, 2), 3)
+    return Effort(True, 1, tmp_path, tmp_path / "state", "x", range(1, 6), range(1, 2), 3)
 
 
 def verdicts(section):
@@ -30,6 +31,23 @@ def test_controllers_that_track_well_until_they_crash_fail(effort, monkeypatch, 
 
     monkeypatch.setattr(control, "cached_figures", rows)
     assert set(verdicts(control.comparison_sections(effort)[0]).values()) == {verdict}
+
+
+def test_ways_out_of_plans_that_were_all_refused_fail(effort, monkeypatch):
+    def rows(effort, name, jobs, work, good):
+        return [] if name == "aborted" else [{"name": name, "seed": seed, "refused": "thrust", "instants": []} for name, seed in jobs]
+
+    monkeypatch.setattr(ways_out, "cached_figures", rows)
+    assert set(verdicts(ways_out.sections(effort)[0]).values()) == {"fails"}
+
+
+@pytest.mark.parametrize("perches, found", [(5, {"holds", "better"}), (4, {"fails", "better"}), (0, {"fails", "worse"})])
+def test_errors_of_few_flights_are_not_those_of_all(effort, perches, found):
+    metrics = {f"{kind}_rmse_m_{axis}": 0.001 for kind in ("tracking", "estimation") for axis in "xyz"}
+    flights = [RunResult(k, k, "perched", "perched", "", metrics=metrics if k < perches else {}) for k in range(5)]
+    section = perching._errors(effort, dict.fromkeys(perching.CONDITIONS, flights))
+    assert set(verdicts(section).values()) == found
+    assert all(f"({perches} of 5 flights)" in row.ours for row in section.rows)
 
 
 def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch):

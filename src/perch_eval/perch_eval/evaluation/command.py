@@ -7,7 +7,6 @@ import os
 import time
 from pathlib import Path
 
-from perch_core.errors import PerchError
 from perch_core.registry import resolved
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.evaluation import document
@@ -49,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"{', '.join(PARTS)}; may be repeated")
     for name, (what, quick, full) in FLIGHTS.items():
         out.add_argument(f"--{name}", type=count, metavar="N", help=f"{what} (default: {quick}, with --full {full})")
-    out.add_argument("--fresh", action="store_true", help="fly again what an earlier evaluation of the same code has flown")
+    out.add_argument("--fresh", action="store_true", help="delete the flights that were kept, and fly all again")
     return out
 
 
@@ -58,10 +57,12 @@ def _regenerate(args: argparse.Namespace) -> int:
     counts = {name: getattr(args, name.replace("-", "_")) or (full if args.full else quick) for name, (_, quick, full) in FLIGHTS.items()}
     made_by = ["python3 scripts/evaluate.py", *["--full"] * args.full, *(f"--{name} {n}" for name, n in counts.items()),
                *(f"--only {name}" for name in args.only or ()), f"--out {args.out}"]
-    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, " ".join(made_by), args.fresh,
+    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, " ".join(made_by),
                     range(1, 1 + counts["seeds"]), range(1, 1 + counts["line-seeds"]), counts["layouts"])
     began = time.monotonic()
-    output_folder(args.out)
+    output_folder(args.out), output_folder(effort.state, "finished flights")
+    for kept in effort.state.glob("*.jsonl") if args.fresh else ():
+        kept.unlink()
     sections = evaluate(effort, [name for name in PARTS if (name in args.only if args.only else args.full or name not in BEYOND_PAPERS)])
     document.write(sections, effort, time.monotonic() - began)
     found = document.counts(sections)
@@ -77,7 +78,7 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
         print(f"[{k + 1}/{len(names)}] {name}", flush=True)
         try:
             part: list[Section] = resolved(f"perch_eval.evaluation.{PARTS[name]}")(effort)
-        except (PerchError, ImportError, ArithmeticError, LookupError, ValueError, AttributeError, TypeError, RuntimeError) as error:
+        except Exception as error:
             broken = Section(name, f"{name} could not be evaluated", "")
             broken.missing(name, "", f"{type(error).__name__}: {error}")
             part = [broken]
@@ -90,4 +91,4 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
     return sections
 
 
-main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, the same command goes on")
+main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, the same command (without --fresh) goes on")

@@ -10,7 +10,7 @@ from typing import Any
 
 from perch_core.json_values import write_json
 from perch_eval.evaluation.sections import BETTER, FAILS, HOLDS, MISSING, VACUOUS, WORSE, Effort, Section
-from perch_eval.revision import banner, commit, digest, code_version
+from perch_eval.revision import banner
 
 _MARK = {HOLDS: "**holds**", FAILS: "**FAILS**", VACUOUS: "*vacuous*", MISSING: "*not available*"}
 
@@ -30,8 +30,8 @@ def write_page(effort: Effort, name: str, lines: list[str], content: dict[str, A
 
 
 def _write(effort: Effort, page: str, lines: list[str], data: str, content: dict[str, Any]) -> None:
-    (effort.out / f"{page}.md").write_text("\n".join([lines[0], "", banner([commit()], [digest()]), *lines[1:]]) + "\n")
-    write_json(effort.out / f"{data}.json", {**code_version(), "command": effort.command, "machine": machine(), **content})
+    (effort.out / f"{page}.md").write_text("\n".join([lines[0], "", banner([effort.code["commit"]], [effort.code["digest"]]), *lines[1:]]) + "\n")
+    write_json(effort.out / f"{data}.json", {**effort.code, "command": effort.command, "machine": machine(), **content})
 
 
 def _made_by(effort: Effort) -> str:

@@ -1,4 +1,7 @@
-"""Flights of an evaluation, kept in a file: finished flights of the same code are reused, so that an evaluation can resume."""
+"""Flights of an evaluation, kept in a file: finished flights of the same code are reused, so that an evaluation can resume.
+
+Without a digest of the code (outside a git repository) nothing is reused, nor are flights that could not be carried out.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,12 @@ from dataclasses import asdict
 from typing import Any, TypeVar
 
 from perch_core.json_values import finite
-from perch_eval.campaign.causes import SUCCESS
+from perch_eval.campaign.causes import ERROR, SUCCESS
 from perch_eval.campaign.engines import Task, run_task
 from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.workers import failed_run, in_processes
 from perch_eval.evaluation.sections import Effort
-from perch_eval.revision import digest
 from perch_eval.rows import Rows, rows_of
 
 T = TypeVar("T")
@@ -32,14 +34,15 @@ def cached_figures(effort: Effort, name: str, jobs: Sequence[T], work: Callable[
         work: flies one job, in another process.
         good: whether the figures count as good in the progress line.
         key: returns the key of a job in the file.
-        dead: returns the figures of a job at which processes die repeatedly.
+        on_worker_death: returns the figures of a job at which processes die repeatedly.
 
     Raises:
-        PerchError: processes die repeatedly at a job, and there is no `dead`.
+        PerchError: processes die repeatedly at a job, and there is no `on_worker_death`.
     """
     effort.state.mkdir(parents=True, exist_ok=True)
-    file = effort.state / f"{name}_{digest()}.jsonl"
-    known: dict[str, dict[str, Any]] = {} if effort.fresh else dict(rows_of(file))
+    code = effort.code["digest"]
+    file = effort.state / f"{name}_{code}.jsonl"
+    known: dict[str, dict[str, Any]] = {job: row for job, row in rows_of(file) if row.get("cause") != ERROR} if code else {}
     missing = [job for job in jobs if key(job) not in known]
     before = [known[key(job)] for job in jobs if key(job) in known]
     found = with_progress(in_processes(work, missing, effort.jobs, on_worker_death), len(jobs), lambda one: good(one[1]),

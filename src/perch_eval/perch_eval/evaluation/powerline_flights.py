@@ -21,7 +21,7 @@ from perch_eval.evaluation.kept import cached_runs
 from perch_eval.evaluation.sections import Effort
 from perch_eval.flight import Flight
 from perch_eval.in_process import Sensing
-from perch_eval.metrics import contact_of
+from perch_eval.metrics import MISSION, contact_of
 from perch_sim.cable_contact import CableLine
 from perch_sim.scenario import Scenario
 
@@ -99,7 +99,8 @@ def perching_errors(flight: Flight, scenario: Scenario, wire_offset: float) -> d
 
 
 def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None]:
-    """Return the mean distance of the mapped target wire from the true one within `MAP_RADIUS` of the target, at the first plan.
+    """Return the mean distance of the mapped target wire from the true one within `MAP_RADIUS` of the target, at the request of the
+    first plan.
 
     Returns:
         `mapping_in_map_m`: distance in map, including the odometry's drift; `mapping_m`: distance relative to the vehicle, the
@@ -108,7 +109,8 @@ def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None
     none: dict[str, float | None] = {"mapping_m": None, "mapping_in_map_m": None}
     plans = _perches(flight)
     truth, estimate = flight.states("ground_truth/odometry"), flight.states("odometry")
-    maps = [m for t, m in flight.values("powerlines") if plans and t <= plans[0][0] and m.lines]
+    lead = MISSION.lead(MISSION.powerline_latency)
+    maps = [m for t, m in flight.values("powerlines") if plans and t <= plans[0][0] - lead and m.lines]
     if not maps or truth is None or estimate is None:
         return none
     point, cable = np.array(scenario.mission.perch_point), CableLine(scenario.world.cables[_target(scenario)])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from perch_eval.revision import code_version
 
 HOLDS, FAILS, VACUOUS, SHOWN, MISSING = "holds", "FAILS", "vacuous", "shown", "not available"
 BETTER, WORSE = "better", "worse"  # a comparison, not a claim
@@ -76,10 +79,10 @@ class Effort:
         out: folder of the results.
         state: folder of the finished flights from which an interrupted evaluation resumes.
         command: command that regenerates the page.
-        fresh: repeat flights that an earlier evaluation has finished.
         seeds: seeds of the flights of each perch condition.
         seeds_on_lines: seeds of the flights of each powerline scenario.
         layouts: number of random layouts of the inspection.
+        code: commit and digest of the code at the start, which are those of flights and pages.
     """
 
     full: bool
@@ -87,7 +90,7 @@ class Effort:
     out: Path
     state: Path
     command: str
-    fresh: bool
     seeds: range
     seeds_on_lines: range
     layouts: int
+    code: Mapping[str, str] = field(default_factory=code_version)

@@ -70,7 +70,7 @@ def sections(effort: Effort) -> list[Section]:
         early = [x for x in instants if x.time_to_contact >= NO_CONTACT_BEFORE]
         planned = sum(not r["refused"] for r in plans)
         out.claim(f"{title}: a way out {NO_CONTACT_BEFORE:g} s before contact and earlier", f"{_share(early)}; {planned} of {len(plans)} planned", "",
-                  planned == len(plans) and sum(not x.refusal for x in early) >= REQUIRED_SHARE * len(early) if early else None,
+                  planned == len(plans) and sum(not x.refusal for x in early) >= REQUIRED_SHARE * len(early) if early or planned < len(plans) else None,
                   f"at least {100 * REQUIRED_SHARE:g} %, all planned")
     flown = cached_figures(effort, "aborted", list(_cancellations()), _fly_cancelled, lambda r: r["end"] in ("hovering", "attached"))
     text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
