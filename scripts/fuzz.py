@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from perch_setup import ROOT, command_parser, enter, quiet_on_interrupt
+from perch_setup.enter import INTERRUPTED
 
 EXAMPLES = """examples:
   python3 scripts/fuzz.py files                          a minute of mutated vehicles, scenarios, boards, campaigns, problems, parameter files
@@ -15,7 +16,7 @@ EXAMPLES = """examples:
   python3 scripts/fuzz.py messages --minutes 20          values into every port of every component
   python3 scripts/fuzz.py services --cases /tmp/found    requests to the planners, the mission, the controller
 
-exit code: 0 nothing found, 1 something found, 2 wrong arguments"""
+exit code: 0 nothing found, 1 something found, 2 wrong arguments, 130 interrupted"""
 
 
 def main() -> int:
@@ -37,12 +38,14 @@ def main() -> int:
 
         fuzzer = importlib.import_module(f"fuzzing.{arguments.kind}")
     report = Report(arguments.kind, arguments.minutes, arguments.cases)
+    code = 0
     try:
         fuzzer.run(arguments.minutes, arguments.seed, report)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
+        code = INTERRUPTED
     print(f"{report.line().strip()}; {len(report.problems)} problems")
-    return 1 if report.problems else 0
+    return code or (1 if report.problems else 0)
 
 
 if __name__ == "__main__":

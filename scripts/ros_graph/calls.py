@@ -47,7 +47,14 @@ def send_goal(graph: GraphConnection, arguments: argparse.Namespace) -> int:
         sys.stdout.flush()
 
     sent = client.send_goal_async(goal, feedback_callback=show if arguments.feedback else None)
-    handle = graph.answer(sent, action)
+    try:
+        handle = graph.answer(sent, action)
+    except KeyboardInterrupt:  # the goal may have been accepted all the same
+        handle = graph.answer(sent, action)
+        if handle.accepted:
+            print("cancelling the goal", file=sys.stderr)
+            graph.answer(handle.cancel_goal_async(), "cancel")
+        raise
     if not handle.accepted:
         print("goal rejected")
         return 1

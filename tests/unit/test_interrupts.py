@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import importlib
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from perch_eval.nodes import executable
@@ -39,6 +41,37 @@ def test_ctrl_c_that_nobody_looked_for_counts_at_the_end_of_the_connection(conne
     with pytest.raises(KeyboardInterrupt), connect():
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("accepted", [True, False])
+def test_ctrl_c_before_a_goal_is_accepted_cancels_it_once_it_is(monkeypatch, connect, accepted):
+    calls = importlib.import_module("ros_graph.calls")
+    answers, cancelled = [KeyboardInterrupt, SimpleNamespace(accepted=accepted, cancel_goal_async=lambda: "cancel"), None], []
+
+    def answer(future, what, timeout=10.0):
+        cancelled.extend(["cancel"] if future == "cancel" else [])
+        if (found := answers.pop(0)) is KeyboardInterrupt:
+            raise KeyboardInterrupt
+        return found
+
+    graph = SimpleNamespace(node=None, absolute=str, spin_until=lambda *_: True, answer=answer)
+    monkeypatch.setattr(calls, "ActionClient", lambda *_: SimpleNamespace(server_is_ready=None, send_goal_async=lambda *_, **__: "sent"))
+    arguments = SimpleNamespace(type="perch_msgs/action/Perch", values="", action="/perch", spin_time=1.0, feedback=False)
+    with pytest.raises(KeyboardInterrupt):
+        calls.send_goal(graph, arguments)
+    assert cancelled == ["cancel"] * accepted
+
+
+def test_ctrl_c_ends_a_search_by_the_exit_code_of_all_scripts(monkeypatch, tmp_path, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    script = importlib.import_module("fuzz")
+    monkeypatch.setattr(script, "enter", lambda: None)
+    monkeypatch.setattr("fuzzing.files.run", interrupted)
+    monkeypatch.setattr(sys, "argv", ["fuzz.py", "files", "--cases", str(tmp_path)])
+    assert script.main() == 130 and "0 problems" in capsys.readouterr().out
 
 
 def test_ctrl_c_while_modules_are_loaded_leaves_no_traceback():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
 
 import pytest
 from perch_eval import soak
@@ -47,6 +49,25 @@ def test_what_was_flown_before_a_soak_was_killed_is_kept(tmp_path, monkeypatch):
         soak.main(["--out", str(tmp_path), "--logs", str(tmp_path)])
     assert "20 of 20 flights perched and departed" in (tmp_path / "README.md").read_text()
     assert (tmp_path / "surface_90.json").exists() and (tmp_path / "surface_90.png").exists()
+
+
+def test_a_soak_that_is_interrupted_keeps_what_was_flown_and_says_so(tmp_path, monkeypatch):
+    first, written, left = flights(lambda k: 100.0)[:1], [], flights(lambda k: 100.0)[:1]
+
+    def once(*_):
+        if not left:
+            raise KeyboardInterrupt
+        return left.pop()
+
+    @contextmanager
+    def stack(*_):
+        yield SimpleNamespace(wait_until_ready=lambda *_: None)
+
+    for name, value in (("Stack", stack), ("MissionClient", lambda: SimpleNamespace(time=0.0, visible_nodes=None, close=lambda: None)),
+                        ("domain_in_environment", nullcontext), ("_write", lambda args, code, began, found: written.extend(found)),
+                        ("_fly_once", once)):
+        monkeypatch.setattr(soak, name, value)
+    assert soak.main(["--out", str(tmp_path), "--logs", str(tmp_path)]) == 130 and written == first
 
 
 def test_equal_problems_are_one_line():

@@ -34,7 +34,8 @@ EXAMPLES = """examples:
   python3 scripts/soak.py --scenario line_80 --flights 10
   python3 scripts/soak.py --cameras --hours 0.1 --name cameras
 
-exit code: 0 every perch and departure succeeded, and nothing grows; 1 otherwise; 2 invalid input"""
+exit code: 0 every perch and departure succeeded, and nothing grows; 1 otherwise; 2 invalid input; 130 interrupted (what has been
+flown is written)"""
 WARM_UP_FLIGHTS = 50          # after which memory must not grow any more
 MAX_GROWTH = 1.0              # of a process per 100 flights [MB]
 READY_TIMEOUT = 180.0         # [s]
@@ -92,7 +93,8 @@ def slope(values: Sequence[float]) -> float | None:
 
 def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: float, flights: int | None, folder: Path,
         save: Callable[[Sequence[Flight]], object]) -> list[Flight]:
-    """Fly until a simulated time or number of flights is reached, failures repeat, or the stack fails.
+    """Fly until a simulated time or number of flights is reached, failures repeat, or the stack fails; save what was flown when
+    interrupted.
 
     Args:
         name: of the scenario.
@@ -102,9 +104,10 @@ def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: f
         hours: of simulated time.
         flights: maximum number of flights; None: no limit.
         folder: receives logs and parameters.
-        save: called every `SAVE_EVERY` flights with all flights so far, to save them.
+        save: called every `SAVE_EVERY` flights with all flights so far, to save them, and with those before an interrupt.
 
     Raises:
+        KeyboardInterrupt: interrupted.
         PerchError: scenario or nodes are refused, the workspace is not built, or no ROS domain is free.
     """
     source = config.find("scenarios", name)
@@ -129,7 +132,9 @@ def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: f
         except StackError as error:
             print(f"\n{error}", file=sys.stderr)
         except KeyboardInterrupt:
-            print("\ninterrupted; what has been flown counts", file=sys.stderr)
+            if found:
+                save(found)
+            raise
     return found
 
 
@@ -274,4 +279,4 @@ def _write(args: argparse.Namespace, code: Mapping[str, str], began: float, flig
     return problems
 
 
-main = command(parser, _soak, psutil.Error)
+main = command(parser, _soak, psutil.Error, interrupted="\ninterrupted; what has been flown counts")
