@@ -21,7 +21,7 @@ def command_line() -> argparse.ArgumentParser:
     goal = commands.add("send_goal", "calls:send_goal", "send a goal and wait for its result")
     goal.add_argument("action")
     goal.add_argument("type", help="as in perch_msgs/action/Perch")
-    goal.add_argument("values", nargs="?", default="", help="fields of the goal in YAML")
+    goal.add_argument("values", help="fields of the goal in YAML")
     goal.add_argument("-f", "--feedback", action="store_true", help="print feedback as it comes")
     return commands.parser
 

@@ -10,7 +10,7 @@ from ros_graph.commands import Commands, carry_out
 
 EXAMPLES = """examples:
   python3 scripts/service.py list -t
-  python3 scripts/service.py call /plan_perch perch_msgs/srv/PlanPerch '{}'
+  python3 scripts/service.py call /abort std_srvs/srv/Trigger
 """
 
 

@@ -6,7 +6,11 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+import action
+import param
+import service
 import start_stack
+import topic
 from perch_control.laws import LAWS
 from perch_control.mission.missions import MISSIONS
 from perch_core.tag_board import load_board
@@ -25,7 +29,20 @@ GUIDES = sorted((Path(__file__).resolve().parents[2] / "docs" / "howto").glob("*
 LOADERS = {"scenario": load_scenario, "board": load_board, "campaign": load_campaign}
 PARSERS = {"demo.py": demo.parser, "campaign.py": campaign.parser, "evaluate.py": evaluation.parser, "replay.py": replay.parser,
            "start_stack.py": start_stack.command_line, "perceive.py": perceive.parser, "sensors.py": sensors_command.parser, "faults.py": faults.parser,
-           "soak.py": soak.parser, "compare.py": comparison.parser}
+           "soak.py": soak.parser, "compare.py": comparison.parser, "action.py": action.command_line, "topic.py": topic.command_line,
+           "service.py": service.command_line, "param.py": param.command_line}
+ROOT = GUIDES[0].parents[2]
+
+
+def _commands():
+    """Commands with a parser in the code of README and docs, with what follows a backslash at the end of a line."""
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
+        code = "\n".join(re.findall(r"^ *```(?:bash)?\n(.*?)```", page.read_text(), re.S | re.M)).replace("\\\n", " ")
+        code = re.sub(r"(?m) # .*$", "", code)
+        for line in re.findall(r"^ *(?:nice -n \d+ )?python3 scripts/(\w+\.py(?:'[^']*'|[^'\n])*)", code, re.M):
+            script, *arguments = shlex.split(line)
+            if script in PARSERS and not any("..." in argument or argument.isupper() for argument in arguments):
+                yield pytest.param(script, arguments, id=f"{page.stem}: {line[:60]}")
 
 
 def blocks(language):
@@ -46,12 +63,9 @@ def test_files_load(text, tmp_path):
     LOADERS[kind](file)
 
 
-@pytest.mark.parametrize("text", blocks("bash"))
-def test_commands_are_accepted(text):
-    for line in text.strip().splitlines():
-        interpreter, script, *arguments = shlex.split(line)
-        assert interpreter == "python3" and script.startswith("scripts/")
-        PARSERS[Path(script).name]().parse_args(arguments)
+@pytest.mark.parametrize("script, arguments", list(_commands()))
+def test_commands_are_accepted(script, arguments):
+    PARSERS[script]().parse_args(arguments)
 
 
 @pytest.mark.parametrize("text", blocks("python"))

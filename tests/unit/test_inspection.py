@@ -85,9 +85,10 @@ def test_a_scenario_says_what_its_nodes_fly():
         fly(dataclasses.replace(BASE, mode="powerline"), 1)
 
 
-@pytest.mark.parametrize("ends, result, message", [(True, Result.PERCHED, "inspected along 2 waypoints"),
-                                                   (False, Result.MISSED, "inspection given up: held up")])
-def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, result, message):
+@pytest.mark.parametrize("ends, off, result, message", [
+    (True, 0.0, Result.PERCHED, "inspected along 2 waypoints"), (False, 0.0, Result.MISSED, "inspection given up: held up"),
+    pytest.param(True, 0.6, Result.PERCHED, "inspected along 2 waypoints", id="the line terms hold it away from its place")])
+def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, off, result, message):
     settings = MissionSettings(waypoints=(1.0, 0.0, 2.0, 0.0, 1.0, 2.0, 2.5, 10.0))
     machine, controller, id, reference, seen, outcome = InspectionMission(settings), ControllerState.DISARMED, 0, None, [], None
     machine.start(Goal(1.2, 10.0, perch_point=np.array([3.0, 0.0, 2.0])), 0.0)
@@ -100,7 +101,7 @@ def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, res
             if share >= 1.0 or (machine.phase is Phase.INSPECTING and not ends and share > 0.5):
                 controller = ControllerState.HOVERING
         target = Target(time, np.array([3.0, 0.0, 2.0]), np.array([0, 0, 0, 1.0]), 0.01, 0.01) if time > 6.0 else None
-        out = machine.tick(Inputs(time, State(p, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3)), True, controller, "held up", id,
+        out = machine.tick(Inputs(time, State(p + [off, 0.0, 0.0], np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3)), True, controller, "held up", id,
                                   target, np.zeros((0, 3))))
         if any(command.name == "ARM" for command, _ in out.commands):
             controller = ControllerState.ARMED

@@ -40,6 +40,10 @@ class InspectionMission(LineMission):
         self._inspected = inputs.time + LEAD + outputs.reference.duration
         self._enter(Phase.INSPECTING, inputs.time, f"inspecting, {outputs.reference.duration:.1f} s")
 
+    def _handle_wrong_place(self, inputs: Inputs) -> bool:
+        """Return False: the controller's line terms may hold the vehicle away from the search place."""
+        return False
+
     def _inspecting(self, inputs: Inputs, outputs: Outputs) -> None:
         if self._handle_fallback(inputs, outputs):
             return
