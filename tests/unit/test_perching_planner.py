@@ -24,6 +24,8 @@ from perch_core.values import PerchPlan, PerchPlanRequest
 from perch_core.vehicle import load_vehicle
 from perch_planner import perching_planner
 from perch_planner.perching_planner import PerchingPlanner, PerchingPlannerParameters, PerchPlanError
+from perch_planner.planner import plan
+from perch_planner.problem import PerchSettings
 from perch_planner.verifier import Requirements, verify
 from unit.planner_asker import Asked
 
@@ -69,11 +71,11 @@ def test_a_plan_comes_as_polynomials_with_certificates(ask: Asked) -> None:
     limits = {c.quantity: (c.lower_limit, c.upper_limit) for c in plan.certificates}
     rest = np.zeros(3)
     need = Requirements(
-        start=np.array([[0.0, 0.0, 1.4], rest, rest, rest]), start_yaw=(0.0, 0.0), waypoints=np.zeros((0, 3)), p_S=WALL.p_WS,
+        start=np.array([[0.0, 0.0, 1.4], rest, rest, rest]), start_yaw=(0.0, 0.0), end_yaw=0.0, waypoints=np.zeros((0, 4, 3)), p_S=WALL.p_WS,
         s1=WALL.R_WS[:, 0], s2=WALL.R_WS[:, 1], s3=WALL.normal, v_S=rest, perch_offset=0.04, mass=0.25,
         impact_acceleration=3.3, impact_speed=(0.65, 0.8), tangential_speed=0.3, contact_delay=0.04, tube=(0.12, 0.01, 0.1, 0.33),
         thrust=limits["thrust"], body_rate=limits["body_rate"][1], speed=limits["speed"][1], height=limits["height"],
-        extension=0.15)
+        extension=0.15, duration=20.0)
     assert verify(plan.trajectory.durations, plan.trajectory.coefficients, need, step=1e-3) == []
     assert "clearance" in str(verify(plan.trajectory.durations, plan.trajectory.coefficients, replace(need, clearance=0.1), step=1e-3))
 
@@ -117,6 +119,15 @@ def test_a_surface_that_faces_up_is_met_from_above(ask: Asked, inclination: floa
     t = np.linspace(0.0, plan.trajectory.duration, 2000)
     samples = [plan.trajectory.sample(x) for x in t]
     assert min((x.p - pad.p_WS) @ pad.normal for x in samples) > 0.04 - 1e-6
+
+
+def test_a_request_is_planned_as_by_plan_py_with_the_same_settings(ask: Asked) -> None:
+    """The impact acceleration that a surface which faces up takes is part of the plan, not of the service; a requested one is kept."""
+    pad = PerchSurface.from_inclination(np.array([2.2, 0.0, 0.6]), math.radians(20.0))
+    direct = plan(perching_planner.perch_problem(request(pad)), PerchSettings(), load_vehicle("snapdragon"))
+    assert np.array_equal(ask(request(pad)).trajectory.coefficients, direct.trajectory.coefficients)
+    end = ask(request(pad, impact_acceleration=5.0)).trajectory
+    assert np.linalg.norm(end.sample(end.duration).a + [0.0, 0.0, 9.81]) == pytest.approx(5.0)
 
 
 def test_waypoints_motion_and_a_moving_target_are_taken(ask: Asked) -> None:

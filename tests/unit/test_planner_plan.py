@@ -9,7 +9,7 @@ import pytest
 from perch_core.errors import ConfigError
 from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_planner import refusals, relaxation, search, solvers
 from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint, contact_heading
@@ -47,7 +47,7 @@ def test_every_inclination_is_reached(inclination):
     end = planned.trajectory.sample(planned.duration)
     state = flat_to_state(end.p, end.v, end.a, end.j, end.s, end.yaw, end.yaw_rate, end.yaw_acc, VEHICLE.mass)
     assert state.R_WB == pytest.approx(target.R_WS, abs=1e-6)  # B coincides with S at contact
-    assert state.thrust == pytest.approx(VEHICLE.mass * 3.3)
+    assert state.thrust == pytest.approx(VEHICLE.mass * max(3.3, GRAVITY * np.cos(np.radians(inclination)) - 0.5 * 0.65 / (0.12 + 0.04)))
 
 
 def test_the_defaults_are_what_is_shipped():
@@ -90,7 +90,7 @@ def test_a_negative_rotor_margin_lets_a_plan_ask_for_more_and_its_certificate_sa
 
 
 @pytest.mark.parametrize("inclination, settings, speed", [
-    (90.0, {"impact_acceleration": 7.0}, 0.8), (135.0, {}, 0.8), (180.0, {}, 0.8), (0.0, {"impact_acceleration": 4.0}, 0.65),
+    (90.0, {"impact_acceleration": 7.0}, 0.8), (135.0, {}, 0.8), (180.0, {}, 0.8), (0.0, {"impact_acceleration": 4.0, "impact_acceleration_fixed": True}, 0.65),
     (90.0, {"impact_speed_min": 0.7, "impact_speed_max": 0.7}, 0.7)])
 def test_the_impact_window_holds_at_the_planned_contact_where_none_holds_for_a_late_one_too(inclination, settings, speed):
     """[M:eq14] The plan is at the edge that is nearest to what the late contact asks for, and the certificate says so."""
@@ -222,6 +222,26 @@ def test_a_clearance_that_the_first_plan_lacks_is_kept(waypoint):
     problem = PerchProblem(HOVER, surface(90.0), (Waypoint(waypoint),))
     least = [next(c for c in checked(problem, PerchSettings(clearance_min=asked)).certificates if c.quantity == "clearance").minimum for asked in (0.0, 0.03)]
     assert least[0] < 0.03 <= least[1]
+
+
+@pytest.mark.parametrize("inclination, velocity", [(0.0, (0.0, 0.0, 0.0)), (20.0, (0.0, 0.0, 0.0)), (20.0, (0.3, 0.0, 0.1))])
+def test_the_plate_stays_in_front_of_the_surface_until_contact(inclination, velocity):
+    """With so small an impact acceleration, the first plan comes from below."""
+    target, settings = surface(inclination), PerchSettings(impact_acceleration_fixed=True)
+    planned = checked(PerchProblem(HOVER, target, target_velocity=velocity), settings)
+    t = np.linspace(0.0, planned.duration, 2000)
+    at = planned.trajectory.sample_many(t)
+    force = at.a + (0.0, 0.0, GRAVITY)
+    plate = at.p - VEHICLE.perch_offset * force / np.linalg.norm(force, axis=1, keepdims=True)
+    assert ((plate - target.p_WS - t[:, None] * velocity) @ target.normal).min() > -2e-4
+    assert planned.iterations > 1
+
+
+def test_a_start_or_waypoint_whose_plate_is_behind_the_surface_is_refused_before_the_search():
+    for problem in (PerchProblem(StartState((1.66, 0.0, 0.83)), surface(0.0)), PerchProblem(HOVER, surface(0.0), (Waypoint((0.5, 0.0, 0.83)),))):
+        with pytest.raises(PerchRefusal, match="it needs more than 0.040 m") as caught:
+            plan(problem, PerchSettings(), VEHICLE)
+        assert caught.value.code == refusals.BOX and caught.value.iterations == 0
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.07])  # at 0.1 m there is a plan

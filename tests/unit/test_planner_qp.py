@@ -229,7 +229,7 @@ def test_the_cut_of_a_body_rate_removes_the_plan_also_where_it_spins(seed):
     where = np.full((5, 2), -1.0)
     where[plan_checks.BODY_RATE] = 0.0, 0.4
     zero = np.zeros(3)
-    cut = Bounds(*limit_cuts(where, coefficients, yaw, durations, zero, zero, np.array([0.0, 0.0, 1.0]), 0.0, 9.0, 9.0, rate, 0.1))
+    cut = Bounds(*limit_cuts(where, coefficients, yaw, durations, zero, zero, np.array([0.0, 0.0, 1.0]), 0.0, 9.0, 9.0, rate, 0.1, 0.0, 0.0))
     terms = cut.places == 0.4
     value = sum(d @ at[order] for d, order in zip(cut.direction[terms], cut.orders[terms]))
     assert value > cut.upper[cut.owner[terms][0]]

@@ -45,7 +45,8 @@ def test_the_untouched_plan_is_accepted():
     ({"extension": 2.0}, "clearance"), ({"tube": (0.15, 0.01, 0.001, 0.001)}, "tube"), ({"impact_speed": (0.7, 0.8)}, "impact speed, least"),
     ({"impact_speed": (0.1, 0.2)}, "impact speed, greatest"), ({"tangential_speed": 1e-3}, "tangential"),
     ({"impact_acceleration": 3.31}, "acceleration at contact"), ({"perch_offset": 0.05}, "position at contact"),
-    ({"v_S": np.array([0.01, 0.0, 0.0])}, "position at contact"), ({"waypoints": np.array([[0.7, 0.1, 1.41]])}, "waypoint 0"),
+    ({"v_S": np.array([0.01, 0.0, 0.0])}, "position at contact"), ({"waypoints": NEED.waypoints + [[[0.0, 0.0, 0.01]]]}, "waypoint 0, derivative 0"),
+    ({"waypoints": np.nan_to_num(NEED.waypoints)}, "waypoint 0, derivative 1"), ({"end_yaw": 0.1}, "heading at contact"), ({"duration": 0.5}, "duration"),
     ({"start": np.array([[0.0, 0.0, 1.5], [0.01, 0.0, 0.0], [0.0] * 3, [0.0] * 3])}, "start, derivative 1"),
     ({"start_yaw": (0.1, 0.0)}, "start yaw"),
     ({"rotors": dataclasses.replace(NEED.rotors, thrust=(0.4, 1.1))}, "rotor thrust, least"),
@@ -53,6 +54,26 @@ def test_the_untouched_plan_is_accepted():
 def test_a_broken_requirement_is_found(changes, words):
     """[M:eq15]"""
     assert words in findings(**changes)
+
+
+def test_the_heading_at_contact_counts_modulo_a_full_turn():
+    assert findings(end_yaw=NEED.end_yaw + 2.0 * np.pi) == ""
+
+
+@pytest.mark.parametrize("length, instants", [(0.12, 12), (0.105, 11), (0.004, 1)])
+def test_the_tube_is_checked_at_all_its_instants(length, instants):
+    """[M:eq15] A tube of no width is left at every instant but the contact."""
+    tube = (length, 0.01, 0.0, 0.0)
+    assert findings(tube=tube).count("tube") == instants
+
+
+def test_a_plate_behind_the_surface_is_found():
+    """Onto a surface that faces up, a small impact acceleration lets the plan come from below where the clearance does."""
+    problem = PerchProblem(StartState((0.0, 0.0, 1.2)), PerchSurface.from_inclination(np.array([1.7, 0.0, 0.8]), np.radians(20.0)))
+    through = dataclasses.replace(SETTINGS, impact_acceleration_fixed=True, clearance_min=-0.2)
+    planned = plan(problem, through, VEHICLE).trajectory
+    need = dataclasses.replace(requirements(problem, through, VEHICLE), clearance=0.0, extension=0.0)
+    assert {f.requirement for f in verify(planned.durations, planned.coefficients, need, step=1e-3)} >= {"plate in front of the surface"}
 
 
 def test_a_contact_faster_than_its_window_is_found_where_no_speed_suits_a_late_one_too():

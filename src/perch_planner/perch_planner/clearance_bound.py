@@ -1,4 +1,4 @@
-"""A proved bound on the distance of the vehicle's rim from the surface, until contact."""
+"""Proved bounds on the distances of the vehicle's rim and of its velcro plate from the surface, until contact."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import numpy as np
 
 from perch_core.arrays import Array
 from perch_core.jit import compiled
-from perch_planner.bounds import BELOW, cross, product, smallest, squared, stays_below
+from perch_planner.bounds import BELOW, cross, maximum, product, smallest, squared, stays_below
 
 _SLACK = 1e-9  # [m^4/s^4] the rim may touch the surface at the contact itself: clearance is proved to sqrt(_SLACK) / |f|, 16 um at 2 m/s^2
+PLATE_SLACK = 1e-4  # [m] by which the plate may be behind the surface
+_WIDTH = 1e-5  # of the enclosure of the least distance [m]
 
 
 @compiled
@@ -73,3 +75,28 @@ def prove_clearance(distances: Array, forces: Array, squares: Array, s3: Array, 
         if failed < 0:
             return gap, -1, 0.0
     return -np.inf, failed, place
+
+
+@compiled
+def least_distance(distances: Array, least: float) -> tuple[float, int, float]:
+    """Least distance of the centre of mass from the surface, where it is below a limit.
+
+    The plate is `perch_offset` below the centre of mass, `perch_offset cos(tilt)` nearer to the surface: a centre of mass that keeps
+    `perch_offset` keeps the plate in front of the surface at any tilt. At larger tilts the rim is nearer than the plate.
+
+    Args:
+        distances: from `surface_distance`, shape (f, 15) [m].
+        least: the limit [m].
+
+    Returns:
+        (proved, segment, place): a proved lower bound of the distance, and where it is attained nearly; segment -1 where the
+        limit is kept to `_WIDTH`.
+    """
+    proved, segment, at = least - _WIDTH, -1, 0.0
+    for i in range(len(distances)):
+        if smallest(distances[i]) >= least:
+            continue
+        _, above, place = maximum(-distances[i], _WIDTH, -least)
+        if -above < proved:
+            proved, segment, at = -above, i, place
+    return proved, segment, at

@@ -25,6 +25,7 @@ _RIM_FACTOR = 1.1               # times the rim's reach at the present tilt, as 
 _RATE_CUT_SHARE = 0.95          # of the body rate's limit
 _LOWER_CUT_FACTOR = 1.02        # cuts of the thrust from below
 _HEIGHT_INSET = 2e-3            # [m]
+_PLATE_SPEED = 0.02             # [m/s] of an approach that the inset of the plate's cuts permits
 _NEIGHBOUR_OFFSET = 1.0 / 24.0  # of a segment: peaks are flat, and a cut at the peak alone moves it to the side
 _NEIGHBOUR_THRUST_SHARE = 0.97  # of the limit; a peak is cut beside its place where the thrust is above this share
 
@@ -88,13 +89,13 @@ def turn_direction(heading: float) -> Array:
 
 @compiled
 def limit_cuts(where: Array, coefficients: Array, yaw: Array, durations: Array, p_S: Array, v_S: Array, s3: Array, low_height: float,
-               high_height: float, speed: float, rate: float, extension: float) -> BoundArrays:
+               high_height: float, speed: float, rate: float, extension: float, clearance: float, offset: float) -> BoundArrays:
     """Cuts where speed, height, clearance or body rate could not be proved.
 
     Args:
         where: places where a proof failed, from `plan_checks.check`.
         coefficients, yaw, durations: the plan.
-        p_S, v_S, s3, low_height, high_height, speed, rate, extension: as for `plan_checks.check`.
+        p_S, v_S, s3, low_height, high_height, speed, rate, extension, clearance, offset: as for `plan_checks.check`.
 
     Returns:
         Fields of `Bounds`.
@@ -123,11 +124,15 @@ def limit_cuts(where: Array, coefficients: Array, yaw: Array, durations: Array, 
                 orders[t], direction[t, 2] = 0, 1.0
                 lower[r], upper[r] = low_height + _HEIGHT_INSET, high_height - _HEIGHT_INSET
             elif row == CLEARANCE:
-                # The rim's distance at the present tilt: right to first order where the tilt does not change.
+                # The rim's reach at the present tilt: right to first order where the tilt does not change.
                 tilt = np.sqrt(max(1.0 - dot(f, s3) ** 2 / squared, 0.0))
                 time = durations[:i].sum() + s * durations[i]
+                surface = dot(s3, p_S) + time * dot(s3, v_S)
                 orders[t] = 0
-                lower[r] = dot(s3, p_S) + time * dot(s3, v_S) + _RIM_FACTOR * extension * tilt + _HEIGHT_INSET
+                if extension * tilt + clearance < dot(s3, x[0]) - surface < offset:  # the plate's proof failed, not the rim's
+                    lower[r] = surface + offset + min(clearance, 0.0) + min(_HEIGHT_INSET, _PLATE_SPEED * (durations.sum() - time))
+                else:
+                    lower[r] = surface + _RIM_FACTOR * extension * tilt + _HEIGHT_INSET + clearance
                 for d in range(3):
                     direction[t, d] = s3[d]
             else:

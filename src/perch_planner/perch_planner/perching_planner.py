@@ -19,7 +19,7 @@ from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory
 from perch_core.values import PerchPlan, PerchPlanRequest, limits, seconds
 from perch_core.values.planning import OPTIONS
-from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
+from perch_core.vehicle import Vehicle, load_vehicle
 from perch_planner import planner, refusals
 from perch_planner.problem import PerchParameters, PerchProblem, PerchSettings, StartState, Waypoint
 from perch_planner.refusals import PerchRefusal
@@ -94,7 +94,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
             limits.check("request", request)
             problem = perch_problem(request)
             vehicle = self._vehicle.with_thrust_ratio(request.thrust_ratio or 1.0)
-            arguments = (method, problem, perch_settings(request, self.config.settings, problem.surface), vehicle)
+            arguments = (method, problem, perch_settings(request, self.config.settings), vehicle)
         except PerchError as error:
             respond(error)
             return
@@ -160,12 +160,8 @@ def perch_problem(request: PerchPlanRequest) -> PerchProblem:
                         tuple(request.segment_times) or None)
 
 
-def perch_settings(request: PerchPlanRequest, settings: PerchSettings, surface: PerchSurface) -> PerchSettings:
-    """Return the settings for a surface, with the options of a request applied.
-
-    Onto a surface that faces up, the vehicle falls with g s3_z - alpha through the whole tube. With a small alpha, its normal
-    speed at the start of the tube would be reversed: it would rise from below the surface. Unless the request sets alpha, half
-    of v_min is therefore kept there: alpha >= g s3_z - v_min / (2 (t_k + contact_delay)).
+def perch_settings(request: PerchPlanRequest, settings: PerchSettings) -> PerchSettings:
+    """Return the settings with the options of a request applied.
 
     Raises:
         ConfigError: an option is out of its range.
@@ -177,10 +173,8 @@ def perch_settings(request: PerchPlanRequest, settings: PerchSettings, surface: 
         changes["objective"] = OBJECTIVES[request.objective]
     if request.minimum_time:
         changes["minimum_time"] = True
-    if "impact_acceleration" not in changes and settings.tube_time > 0.0:
-        slowest = changes.get("impact_speed_min", settings.impact_speed_min)
-        shed = 0.5 * slowest / (settings.tube_time + settings.contact_delay)
-        changes["impact_acceleration"] = max(settings.impact_acceleration, GRAVITY * float(surface.normal[2]) - shed)
+    if "impact_acceleration" in changes:
+        changes["impact_acceleration_fixed"] = True
     try:
         return config.replace(settings, **changes) if changes else settings
     except ConfigError as error:

@@ -12,7 +12,7 @@ from perch_core.jit import compiled
 from perch_core.vehicle import GRAVITY
 from perch_planner.body_rate_bound import prove_rate, rate_coarse_bound, squared_rate
 from perch_planner.bounds import magnitude, maximum, smallest, squared, time_derivative
-from perch_planner.clearance_bound import prove_clearance, surface_distance
+from perch_planner.clearance_bound import PLATE_SLACK, least_distance, prove_clearance, surface_distance
 
 THRUST, SPEED, HEIGHT, CLEARANCE, BODY_RATE, ROTOR_THRUST = range(6)
 """Rows of the results; thrust is the specific thrust |a + g e3|. `check` gives the first five, which are proved."""
@@ -152,7 +152,7 @@ def _record_failure(where: Array, row: int, segment: int, place: float) -> None:
 @compiled
 def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S: Array, v_S: Array, s3: Array,
           low_thrust: float, high_thrust: float, speed: float, low_height: float, high_height: float, extension: float,
-          clearance: float, rate: float) -> tuple[Array, Array, bool]:
+          clearance: float, offset: float, rate: float) -> tuple[Array, Array, bool]:
     """Prove every limit of a plan, or find where it fails.
 
     Args:
@@ -165,7 +165,8 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
         speed: limit [m/s].
         low_height, high_height: limits [m].
         extension: radius of the vehicle's disc [m].
-        clearance: least distance of its rim from the surface [m].
+        clearance: least distance of its rim from the surface [m]; where it is negative, also that of its plate.
+        offset: distance of the plate below the centre of mass [m].
         rate: limit of |omega| [rad/s].
 
     Returns:
@@ -237,6 +238,12 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
         _record_failure(where, CLEARANCE, i, place)
         if gap_sampled < clearance:
             out[CLEARANCE, MINIMUM] = gap_sampled
+    nearest, i, place = least_distance(distances, offset)
+    if nearest < offset - PLATE_SLACK:
+        if nearest - offset < out[CLEARANCE, MINIMUM]:
+            out[CLEARANCE, MINIMUM], out[CLEARANCE, MINIMUM_AT] = nearest - offset, begins[i] + place * durations[i]
+        if nearest < offset + min(clearance, 0.0) - PLATE_SLACK:
+            _record_failure(where, CLEARANCE, i, place)
     out[BODY_RATE, MAXIMUM] = np.inf if rate_sampled < rate else rate_sampled
     if rate_sampled < rate:  # else a sample is too fast
         out[BODY_RATE, MAXIMUM], i, place, found, found_at = prove_rate(forces, squares, jerks, yaw, durations, coarse, rate,

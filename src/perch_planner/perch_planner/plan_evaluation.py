@@ -28,6 +28,7 @@ class PlanLimits(NamedTuple):
         speed: limit [m/s].
         low_height, high_height: limits of the height [m].
         extension, clearance: radius of the vehicle's disc, least distance of its rim from the surface [m].
+        offset: distance of the velcro plate below the centre of mass [m].
         rate: limit of |omega| [rad/s].
         small_violation: violations of the thrust range below this are cut together with the other limits [m/s^2].
         waypoints: their number; thrust peaks in as many first segments are stretched rather than cut, later ones only where
@@ -45,6 +46,7 @@ class PlanLimits(NamedTuple):
     high_height: float
     extension: float
     clearance: float
+    offset: float
     rate: float
     small_violation: float
     waypoints: int
@@ -107,7 +109,7 @@ def check_plan(coefficients: Array, yaw: Array, heading: Array, durations: Array
         three as in `PlanCheck`; thrust, other: cuts of the thrust and of the other limits, fields of `Bounds`; thrusts: from
         `rotor_thrusts.sample_rotor_thrusts`, empty where the rotors were not checked.
     """
-    p_S, v_S, s3, turn_direction, low, high, speed, low_height, high_height, extension, clearance, rate, small_violation, waypoints = plan_limits
+    p_S, v_S, s3, turn_direction, low, high, speed, low_height, high_height, extension, clearance, offset, rate, small_violation, waypoints = plan_limits
     extrema, least, most = thrust_extrema(coefficients, durations, low, high)
     violated = most > high or least < low
     stretch = violated and allow_stretch and _prefer_stretch(extrema, high, waypoints)
@@ -115,7 +117,7 @@ def check_plan(coefficients: Array, yaw: Array, heading: Array, durations: Array
     results, where, holds, rotors_hold = np.empty((6, 5)), np.full((5, 2), -1.0), False, True
     if checked:
         results[:5], where, holds = check(coefficients, yaw, durations, extrema, p_S, v_S, s3, low, high, speed, low_height,
-                                          high_height, extension, clearance, rate)
+                                          high_height, extension, clearance, offset, rate)
     thrusts = np.empty((0, 4, 0))
     if checked or not (after_first or stretch or least < _ROTOR_CHECK_SHARE * low):
         low_rotor, high_rotor, mass, J, mixing = rotors
@@ -128,5 +130,5 @@ def check_plan(coefficients: Array, yaw: Array, heading: Array, durations: Array
     thrust = thrust_cuts(coefficients, durations, extrema, low if cut else -np.inf, high if cut else np.inf, turn_direction)
     if not cut:
         where[:] = -1.0
-    other = limit_cuts(where, coefficients, yaw, durations, p_S + clearance * s3, v_S, s3, low_height, high_height, speed, rate, extension)
+    other = limit_cuts(where, coefficients, yaw, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension, clearance, offset)
     return extrema, results, (least, most, checked, rotors_hold, holds, stretch), thrust, other, thrusts

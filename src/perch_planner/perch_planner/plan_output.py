@@ -12,7 +12,7 @@ from perch_core.flatness import FlatState, flat_to_state
 from perch_core.vehicle import Vehicle
 from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP
 from perch_planner.planner import PerchPlan
-from perch_planner.problem import Limits, PerchProblem, PerchSettings
+from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
 from perch_planner.verifier import Requirements, Rotors
 
 COLUMNS = ("time", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw", "qx", "qy", "qz", "qw", "wx", "wy", "wz",
@@ -57,18 +57,20 @@ def as_json(plan: PerchPlan) -> dict[str, Any]:
 
 def requirements(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Requirements:
     """Return the requirements on a plan as plain numbers for the verifier."""
+    settings = settings.for_surface(problem.surface)
     limits, start, surface = Limits.of(settings, vehicle), problem.start, problem.surface
     each = Rotors(np.array(vehicle.inertia), vehicle.allocation, limits.rotor_thrust)
     return Requirements(
         start=np.array([start.p, start.v, start.a, start.j]), start_yaw=(start.yaw, start.yaw_rate),
-        waypoints=np.array([w.p for w in problem.waypoints]).reshape(-1, 3), p_S=surface.p_WS, s1=surface.R_WS[:, 0],
-        s2=surface.R_WS[:, 1], s3=surface.normal, v_S=problem.target_velocity, perch_offset=vehicle.perch_offset,
+        end_yaw=contact_heading(surface),
+        waypoints=np.array([[np.full(3, np.nan) if x is None else x for x in (w.p, w.v, w.a, w.j)] for w in problem.waypoints]).reshape(-1, 4, 3),
+        p_S=surface.p_WS, s1=surface.R_WS[:, 0], s2=surface.R_WS[:, 1], s3=surface.normal, v_S=problem.target_velocity, perch_offset=vehicle.perch_offset,
         mass=vehicle.mass, impact_acceleration=settings.impact_acceleration,
         impact_speed=(settings.impact_speed_min, settings.impact_speed_max), tangential_speed=settings.tangential_speed_max,
         contact_delay=settings.contact_delay,
         tube=(settings.tube_time, TUBE_STEP, TUBE_SHARE, TUBE_FLOOR), thrust=limits.thrust,
         body_rate=limits.body_rate, speed=limits.speed, height=limits.height, extension=limits.extension,
-        clearance=limits.clearance, rotors=each)
+        duration=settings.duration_max, clearance=limits.clearance, rotors=each)
 
 
 def draw(path: Path, plan: PerchPlan, problem: PerchProblem, limits: Limits, vehicle: Vehicle) -> None:

@@ -59,7 +59,7 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     Raises:
         PerchRefusal: no plan exists or was found; carries the violated constraint and its margin.
     """
-    begin = perf_counter()
+    begin, settings = perf_counter(), settings.for_surface(problem.surface)
     limits = Limits.of(settings, vehicle)
     refusals.check_feasibility(problem, settings, limits, vehicle)
     search = Search(problem, settings, vehicle, limits)

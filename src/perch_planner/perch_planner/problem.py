@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from importlib.util import find_spec
 from math import atan2, hypot
@@ -14,7 +14,7 @@ from perch_core.config import choice, quantity
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory
-from perch_core.vehicle import Vehicle
+from perch_core.vehicle import GRAVITY, Vehicle
 
 _ZERO: Any = (0.0, 0.0, 0.0)  # made an array, as what is given
 
@@ -147,7 +147,7 @@ class PerchParameters:
     speed_max: float = quantity(12.0, unit="m/s", above=0.0, doc="bound on the speed in W")
     height_min: float = quantity(0.15, unit="m", low=-1e4, high=1e4, doc="floor for the centre of mass")
     height_max: float = quantity(1e3, unit="m", low=-1e4, high=1e4, doc="ceiling for the centre of mass")
-    clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of the body's rim from the surface")
+    clearance_min: float = quantity(0.0, unit="m", low=-1e3, high=2.0, doc="least distance of the body's rim from the surface; negative: of the plate, too")
     duration_max: float = quantity(20.0, unit="s", above=0.1, high=600.0, doc="longest plan")
 
     def __post_init__(self) -> None:
@@ -168,12 +168,26 @@ class PerchSettings(PerchParameters):
     Where the description of an option names the vehicle, 0 stands for the limit of the vehicle file.
     """
 
+    impact_acceleration_fixed: bool = quantity(False, doc="impact_acceleration also for surfaces that face up, for which it is raised otherwise")
     thrust_max: float = quantity(0.0, unit="N", low=0.0, doc="tau_max of [M:eq16]; 0: thrust_reserve x the vehicle's")
     thrust_min: float = quantity(0.0, unit="N", low=0.0, doc="tau_min of [M:eq16]; 0: the vehicle's")
     body_rate_max: float = quantity(0.0, unit="rad/s", low=0.0, doc="bound on |omega|; 0: the vehicle's")
     objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
     minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
     solver: str = choice("daqp" if find_spec("daqp") else "osqp", options=("daqp", "osqp"), doc="of the quadratic programs")
+
+    def for_surface(self, surface: PerchSurface) -> PerchSettings:
+        """Return the settings of a plan to a surface, with a raised `impact_acceleration` where the surface faces up.
+
+        Onto such a surface, the vehicle falls with g s3_z - alpha through the whole tube. With a small alpha, its normal speed at
+        the start of the tube would be reversed: it would rise from below the surface. Half of v_min is therefore kept there:
+        alpha >= g s3_z - v_min / (2 (t_k + contact_delay)).
+        """
+        if self.impact_acceleration_fixed or self.tube_time <= 0.0:
+            return self
+        shed = 0.5 * self.impact_speed_min / (self.tube_time + self.contact_delay)
+        least = GRAVITY * float(surface.normal[2]) - shed
+        return self if least <= self.impact_acceleration else replace(self, impact_acceleration=least)
 
 
 class Limits(NamedTuple):
@@ -185,7 +199,8 @@ class Limits(NamedTuple):
         speed: greatest speed in W [m/s].
         height: least and greatest height of the centre of mass [m].
         extension: radius of the disc around the centre of mass that stays in front of the surface until contact [m].
-        clearance: least distance of that disc from the surface [m].
+        clearance: least distance of that disc from the surface [m]; where it is negative, also that of the velcro plate.
+        perch_offset: distance of the velcro plate below the centre of mass [m].
         rotor_thrust: thrust of each rotor, least and greatest [N].
     """
 
@@ -195,6 +210,7 @@ class Limits(NamedTuple):
     height: tuple[float, float]
     extension: float
     clearance: float
+    perch_offset: float
     rotor_thrust: tuple[float, float]
 
     @classmethod
@@ -209,6 +225,7 @@ class Limits(NamedTuple):
             height=(settings.height_min, settings.height_max),
             extension=max(vehicle.body_radii[:2]),
             clearance=settings.clearance_min,
+            perch_offset=vehicle.perch_offset,
             rotor_thrust=(least + free, most - free),
         )
 

@@ -12,6 +12,7 @@ from perch_core.values import Certificate
 from perch_core.vector3 import norm
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.body_rate_bound import squared_rate
+from perch_planner.clearance_bound import PLATE_SLACK
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 
 _ROUNDING = 1e-6  # of a start that is a state of a plan at its limit
@@ -41,7 +42,7 @@ class PerchRefusal(PlanningRefusal):
 
 @compiled
 def _precheck_quantities(points: Array, a: Array, j: Array, yaw: float, yaw_rate: float, R_WS: Array, extension: float, offset: float,
-                         moving: bool, low_height: float, high_height: float, clearance: float
+                         moving: bool, low_height: float, high_height: float, nearest: float
                          ) -> tuple[float, float, float, float, int, float, int, float, float]:
     """Quantities of a plan that its start and its points determine.
 
@@ -51,7 +52,7 @@ def _precheck_quantities(points: Array, a: Array, j: Array, yaw: float, yaw_rate
         R_WS: axes of the surface, the last its outward normal.
         extension, offset: radius of the vehicle's disc, and distance of its centre from the surface at contact [m].
         moving: the height of the contact is unknown, as the target moves vertically.
-        low_height, high_height, clearance: limits [m].
+        low_height, high_height, nearest: limits; the last is that of the distance of a waypoint from the surface's plane [m].
 
     Returns:
         (specific thrust of the start [m/s^2], its body rate [rad/s], reach of the rim towards the surface at the start [m],
@@ -75,7 +76,7 @@ def _precheck_quantities(points: Array, a: Array, j: Array, yaw: float, yaw_rate
             path_length += norm((points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1], points[k, 2] - points[k - 1, 2]))
         if k == 0:
             start = plane_distance
-        elif k < last and too_near < 0 and plane_distance <= clearance:
+        elif k < last and too_near < 0 and plane_distance <= nearest:
             too_near, distance = k, plane_distance
     return specific, rate, extension * sqrt(1.0 - cosine * cosine), start, out_of_range, height, too_near, distance, path_length
 
@@ -104,9 +105,11 @@ def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Li
         raise PerchRefusal(THRUST_FLOOR, "hover thrust m g below tau_max [M:eq16]", high - 1.02 * hover,
                            f"thrust_max {high:.3f} N leaves no reserve above the hover thrust {hover:.3f} N")
     start, surface = problem.start, problem.surface
+    plate = limits.perch_offset + min(limits.clearance, 0.0) - PLATE_SLACK
+    least = max(limits.clearance, plate)
     specific, rate, rim, distance, out_of_range, height, too_near, waypoint_distance, path_length = _precheck_quantities(
         problem.points, start.a, start.j, start.yaw, start.yaw_rate, surface.R_WS, limits.extension, vehicle.perch_offset, bool(problem.target_velocity[2]),
-        *limits.height, limits.clearance)
+        *limits.height, least)
     specific *= vehicle.mass
     if not low <= specific <= high:
         raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
@@ -128,12 +131,12 @@ def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Li
         raise PerchRefusal(BOX, "speed_max and duration_max", limits.speed * settings.duration_max - path_length,
                            f"the path to the contact is {path_length:.1f} m, longer than speed_max {limits.speed:g} m/s covers in duration_max "
                            f"{settings.duration_max:g} s")
-    if distance <= rim + limits.clearance:
-        raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - rim - limits.clearance,
-                           f"the start is {_describe_distance(distance)}; it needs more than {rim + limits.clearance:.3f} m in front of it")
+    if distance <= (needed := max(rim + limits.clearance, plate)):
+        raise PerchRefusal(BOX, "clearance of the start from the surface's plane", distance - needed,
+                           f"the start is {_describe_distance(distance)}; it needs more than {needed:.3f} m in front of it")
     if too_near >= 0 and at_rest:
-        raise PerchRefusal(BOX, f"clearance of waypoint {too_near - 1} from the surface's plane", waypoint_distance - limits.clearance,
-                           f"waypoint {too_near - 1} is {_describe_distance(waypoint_distance)}; it needs more than {limits.clearance:.3f} m in front of it")
+        raise PerchRefusal(BOX, f"clearance of waypoint {too_near - 1} from the surface's plane", waypoint_distance - least,
+                           f"waypoint {too_near - 1} is {_describe_distance(waypoint_distance)}; it needs more than {least:.3f} m in front of it")
 
 
 def _describe_distance(distance: float) -> str:

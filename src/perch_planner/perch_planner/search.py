@@ -84,7 +84,7 @@ class Search:
         self.end_yaw = contact_heading(problem.surface)
         self.plan_limits = PlanLimits(
             problem.surface.p_WS, problem.target_velocity, problem.surface.normal.copy(), turn_direction(self.end_yaw), self.low,
-            self.high, limits.speed, *limits.height, limits.extension, limits.clearance, limits.body_rate, _SMALL_VIOLATION * self.high,
+            self.high, limits.speed, *limits.height, limits.extension, limits.clearance, limits.perch_offset, limits.body_rate, _SMALL_VIOLATION * self.high,
             len(problem.waypoints))
         self.rotors = (*limits.rotor_thrust, *rotor_model(vehicle))
         self.attempts: list[Attempt] = []

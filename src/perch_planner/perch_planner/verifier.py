@@ -21,6 +21,7 @@ from perch_core.arrays import Array, Numbers
 
 _G = 9.81
 _TOLERANCE = 1e-9  # of the end conditions, relative to 1 + their size
+_PLATE_TOLERANCE = 1e-4  # of the plate's distance from the surface [m]
 _TURN = 1e-4  # [s] between the rotations from which rates and accelerations are taken
 
 
@@ -46,10 +47,11 @@ class Requirements:
     Attributes:
         start: position, velocity, acceleration, jerk at time 0, shape (4, 3).
         start_yaw: yaw and its rate at time 0.
-        waypoints: positions to pass, shape (k, 3).
+        end_yaw: heading at contact, at rest, modulo a full turn [rad].
+        waypoints: position, velocity, acceleration, jerk at each waypoint, shape (k, 4, 3); nan where free.
         p_S, s3, v_S: point of the surface at time 0 [m], outward normal, velocity [m/s], shape (3,).
         s1, s2: directions in the surface, shape (3,).
-        perch_offset: distance of the centre of mass from the surface at contact [m].
+        perch_offset: distance of the velcro plate below the centre of mass, and of the latter from the surface at contact [m].
         mass: [kg].
         impact_acceleration: alpha [m/s^2].
         impact_speed: least and greatest speed along -s3 [m/s].
@@ -62,12 +64,14 @@ class Requirements:
         speed: greatest [m/s].
         height: least and greatest [m].
         extension: radius of the rim [m].
-        clearance: least distance of the rim from the surface [m].
+        duration: longest [s].
+        clearance: least distance of the rim from the surface [m]; where it is negative, also that of the plate.
         rotors: limits of the single rotors, or None.
     """
 
     start: Array
     start_yaw: tuple[float, float]
+    end_yaw: float
     waypoints: Array
     p_S: Array
     s1: Array
@@ -86,6 +90,7 @@ class Requirements:
     speed: float
     height: tuple[float, float]
     extension: float
+    duration: float
     clearance: float = 0.0
     rotors: Rotors | None = None
 
@@ -206,6 +211,10 @@ def verify(durations: Numbers, segments: Any, need: Requirements, step: float = 
     equal("position at contact", last.at([1.0], 0)[0, :3], need.p_S + need.v_S * end + need.perch_offset * need.s3, end)
     contact = need.impact_acceleration * need.s3 - np.array([0.0, 0.0, _G])
     equal("acceleration at contact [M:eq11]", last.at([1.0], 2)[0, :3], contact, end, slack=10.0)
+    yaw, yaw_rate = last.at([1.0], 0)[0, 3], last.at([1.0], 1)[0, 3]
+    equal("heading at contact [M:eq12]", np.remainder(yaw - need.end_yaw + np.pi, 2.0 * np.pi), np.array(np.pi), end)
+    equal("yaw rate at contact", yaw_rate, np.array(0.0), end, slack=10.0)
+    at_most("duration", end, need.duration, end, 1e-9)
     _check_impact(last.at([1.0], 1)[0, :3] - need.v_S, need.contact_delay * contact, need, end, at_most)
     _check_tube(pieces, begins, need, contact, at_most)
     for piece, begin in zip(pieces, begins):
@@ -226,7 +235,9 @@ def _check_knots(pieces: list[_Segment], begins: Array, need: Requirements, equa
             left, right = pieces[k].at([1.0], order)[0], pieces[k + 1].at([0.0], order)[0]
             equal(f"continuity of derivative {order} [M:eq7]", left, right, float(begins[k + 1]), slack=30.0**order)
     for k, waypoint in enumerate(need.waypoints):
-        equal(f"waypoint {k} [M:eq6]", pieces[k].at([1.0], 0)[0, :3], waypoint, float(begins[k + 1]))
+        for order, expected in enumerate(waypoint):
+            if np.isfinite(expected).all():
+                equal(f"waypoint {k}, derivative {order} [M:eq6]", pieces[k].at([1.0], order)[0, :3], expected, float(begins[k + 1]), slack=10.0**order)
 
 
 def _check_impact(v: Array, velocity_change: Array, need: Requirements, end: float, at_most: AtMost) -> None:
@@ -247,7 +258,7 @@ def _check_impact(v: Array, velocity_change: Array, need: Requirements, end: flo
 def _check_tube(pieces: list[_Segment], begins: Array, need: Requirements, contact: Array, at_most: AtMost) -> None:
     length, step, q, floor = need.tube
     half = np.maximum(np.abs(q * contact), floor)
-    for j in range(round(length / step)):
+    for j in range(int(np.ceil(length / step - 1e-9))):
         t = float(begins[-1]) - length + j * step
         if t < 0.0:
             continue
@@ -269,7 +280,7 @@ def _check_exact(piece: _Segment, begin: float, need: Requirements, at_most: AtM
 
 
 def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float, at_most: AtMost) -> None:
-    """Check body rate and clearance on samples; the body rate from rotations half a step apart."""
+    """Check body rate, clearance and plate on samples; the body rate from rotations half a step apart."""
     count = max(int(np.ceil(piece.duration / step)), 2)
     s = (np.arange(count) + 0.5) / count
     h = 0.25 / count
@@ -278,12 +289,14 @@ def _check_dense(piece: _Segment, begin: float, need: Requirements, step: float,
     worst = int(rate.argmax())
     at_most("body rate [M:eq13]", float(rate[worst]), need.body_rate, begin + s[worst] * piece.duration, 1e-4 * need.body_rate)
     f = piece.force(s)
+    b3 = f / _length(f)
     times = begin + s * piece.duration
     distance = (piece.at(s, 0, slice(0, 3)) - need.p_S - times[:, None] * need.v_S) @ need.s3
-    sine = (_length(np.cross(f, need.s3)) / _length(f))[:, 0]
-    gap = distance - need.extension * sine
-    worst = int(gap.argmin())
-    at_most("clearance", need.clearance, float(gap[worst]), float(times[worst]), 1e-9)
+    for name, least, reach, slack in (
+            ("clearance", need.clearance, need.extension * _length(np.cross(b3, need.s3))[:, 0], 1e-9),
+            ("plate in front of the surface", min(need.clearance, 0.0), need.perch_offset * (b3 @ need.s3), _PLATE_TOLERANCE)):
+        worst = int((distance - reach).argmin())
+        at_most(name, least, float(distance[worst] - reach[worst]), float(times[worst]), slack)
 
 
 def _turn_rates(before: Axes, after: Axes, step: float) -> Array:

@@ -53,7 +53,7 @@ def _scene(planned: PlannedProblem, axes: Axes) -> SideView:
         axes.plot(*ends.T, color=WIRE, lw=2 if target else 1, alpha=0.5)
         axes.plot(*view(line.centre), "o", color=WIRE, ms=7 if target else 4)
         axes.annotate(f"line {line.id}", tuple(view(line.centre)), xytext=(6, 6), textcoords="offset points", fontsize=8)
-    axes.axhline(planned.problem.settings.height_min, color="0.5", ls=":", lw=1)
+    axes.axhline(planned.problem.settings.height_min, color="0.5", ls=":", lw=1, label="least height")
     axes.set(xlabel="towards the line [m]", ylabel="height [m]", aspect="equal")
     return view
 
