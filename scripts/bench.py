@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Run the benchmarks of perch and check whether their bars hold on this machine."""
+"""Run the benchmarks of perch and check whether the required values are met on this machine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EXAMPLES = """examples:
   python3 scripts/bench.py planner --json out.json  and the figures as JSON
   python3 scripts/bench.py planner --quick          fewer repetitions, for a first look
 
-exit code: 0 every bar holds, 1 a bar does not hold or a group could not be measured, 2 wrong arguments"""
+exit code: 0 every required value is met, 1 one is not or a group could not be measured, 2 wrong arguments"""
 
 
 def main() -> int:

@@ -23,7 +23,7 @@ def main() -> int:
     """Fuzz inputs of one kind; the kinds are modules of tests/fuzzing."""
     kinds = sorted(path.stem for path in (ROOT / "tests" / "fuzzing").glob("*.py") if "\ndef run(" in path.read_text())
     parser = command_parser(__doc__, EXAMPLES)
-    parser.add_argument("kind", choices=kinds, help="of inputs")
+    parser.add_argument("kind", choices=kinds, help="kind of input")
     parser.add_argument("--minutes", type=float, default=1.0, help="of the search (default: %(default)g)")
     parser.add_argument("--seed", type=int, default=1, help="of the mutations (default: %(default)s)")
     parser.add_argument("--cases", type=Path, default=ROOT / "tests" / "fuzz" / "cases", metavar="DIR",

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from itertools import islice
 
 import cv2
@@ -10,10 +11,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
+from perch_core.sensors import load_sensors
 from perch_eval.recordings import command
 from perch_eval.recordings.asl import AslRecording
-from perch_eval.recordings.bag import BagRecording
+from perch_eval.recordings.bag import BagRecording, _topic
 from perch_eval.recordings.command import _unused
+from perch_eval.recordings.recording import RecordingError
 from perch_eval.recordings.trajectory import read_trajectory, read_truth
 from recordings import photo_flight
 
@@ -76,6 +79,18 @@ def test_a_bag_that_broke_off_is_read_as_far_as_it_goes_with_its_truth_on_a_topi
     assert seen["vio"]["ate_rmse_m"] < 0.015 and seen["vio"]["path_m"] > 0.5
     vio, true = read_trajectory(tmp_path / "out" / "vio.tum"), read_trajectory(tmp_path / "out" / "truth.tum")
     assert true.stamps[0] == photo_flight.START and len(vio) > 50  # to the nanosecond
+
+
+def test_topics_that_the_recording_lacks_are_those_of_the_nodes(files):
+    """A calibration names those of its own recording; drivers are remapped for the nodes."""
+    available = {"/imu/data_raw", "/quad1/camera_down/image_raw/compressed", "/imu0"}
+    assert _topic(("/imu0", "imu/data_raw"), available) == "/imu0" and _topic(("/imu1", "imu/data_raw"), available) == "/imu/data_raw"
+    assert _topic(("/cam0/image_raw", "camera_down/image_raw"), available) == "/quad1/camera_down/image_raw/compressed"
+    sensors = load_sensors(files / "mine.yaml")
+    for other, words in ((replace(sensors, cameras={"x": replace(sensors.cameras["cam0"], topic="/x")}), r"`topic`, or camera_<name>/image_raw"),
+                         (replace(sensors, imu=replace(sensors.imu, topic="/x")), r"no IMU on /x \(`topic` of the IMU")):
+        with pytest.raises(RecordingError, match=words):
+            BagRecording(files / "mcap", other)
 
 
 def test_a_truth_on_another_clock_costs_the_comparison_alone(files, tmp_path, capsys, monkeypatch):

@@ -258,6 +258,12 @@ def test_a_damaged_recording_is_said_to_be_one(recorded, tmp_path, capsys):
         assert "cut off or damaged" in said and "holds no ground_truth/odometry as far as it can be read" in said
 
 
+def test_a_folder_stands_for_its_recording(recorded, tmp_path):
+    path, _ = recorded
+    shutil.copy(path, tmp_path / "flight.mcap")
+    assert main([str(tmp_path), "--instants", "2", "--out", str(tmp_path / "f.png")]) == 0
+
+
 def test_no_recording_is_invalid_input(tmp_path, capsys):
     assert main([str(tmp_path / "none.mcap")]) == 2
     (tmp_path / "empty.mcap").write_bytes(b"")

@@ -196,7 +196,9 @@ def test_an_autopilot_may_descend_before_its_motors_stop():
 
 
 @pytest.mark.parametrize("arguments, words", [(["--vehicle", "nothing"], "nothing: unknown"),
-                                              (["--vehicle", "rpg_published", "--listen", "0"], "[1, 300] s")])
+                                              (["--vehicle", "rpg_published", "--listen", "0"], "[1, 300] s"),
+                                              (["--vehicle", "rpg_published", "--takeover"], "needs --props-off"),
+                                              (["--vehicle", "rpg_published", "--watchdog"], "needs --props-off")])
 def test_mistakes_are_one_line(arguments, words, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["preflight.py", *arguments])
     assert command.main() == 2

@@ -22,8 +22,8 @@ def parser() -> argparse.ArgumentParser:
     out = argparse.ArgumentParser(prog="betaflight.py", description=__doc__, epilog=EXAMPLES,
                                   formatter_class=argparse.RawDescriptionHelpFormatter)
     verbs = out.add_subparsers(dest="verb", required=True)
-    verbs.add_parser("build", help="make the program where it is not there yet")
-    for verb, text in (("configure", "send the settings, have them saved"), ("check", "read the settings back")):
+    verbs.add_parser("build", help="build the firmware if it is missing")
+    for verb, text in (("configure", "send the settings and save them"), ("check", "read the settings back")):
         one = verbs.add_parser(verb, help=text)
         one.add_argument("link", help="/dev/ttyACM0, /dev/ttyACM0@921600 or tcp:HOST:PORT")
         one.add_argument("configuration", nargs="?", default="betaflight", help="of config/autopilot, or a file (default: %(default)s)")

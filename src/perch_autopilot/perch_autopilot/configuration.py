@@ -53,7 +53,8 @@ def load_configuration(name: str) -> Configuration:
     try:
         text = file.read_text()
     except (OSError, ValueError) as error:
-        raise ConfigError("autopilot.configuration", str(name), f"cannot be read: {error}") from None
+        why = "no such file" if isinstance(error, FileNotFoundError) else str(error)
+        raise ConfigError("autopilot.configuration", str(file), f"cannot be read: {why}") from None
     lines = tuple(line for raw in text.splitlines() if (line := " ".join(raw.split("#")[0].split())))
     for line in lines:
         if not (_SET.fullmatch(line) or line.split()[0] in ("feature", "aux", "map", "rxrange", "serial", "mixer")):

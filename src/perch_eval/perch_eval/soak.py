@@ -36,7 +36,7 @@ EXAMPLES = """examples:
 
 exit code: 0 every perch and departure succeeded, and nothing grows; 1 otherwise; 2 invalid input; 130 interrupted (what has been
 flown is written)"""
-WARM_UP_FLIGHTS = 50          # after which memory must not grow any more
+WARM_UP_FLIGHTS = 50          # after which memory must not grow
 MAX_GROWTH = 1.0              # of a process per 100 flights [MB]
 READY_TIMEOUT = 180.0         # [s]
 MAX_CONSECUTIVE_FAILURES = 5  # after which it ends

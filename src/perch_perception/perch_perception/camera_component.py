@@ -76,7 +76,7 @@ class CameraComponent(Component[C], ABC):
         if config.camera not in usable:
             mount = mounts.get(config.camera)
             why = "not there" if mount is None else self.rejection_reason(mount)
-            raise ConfigError(type(self).__name__, "camera",
+            raise ConfigError("parameters", "camera",
                               f"{config.camera!r} of {config.sensors if self._calibrated else config.vehicle} is {why}; usable: {', '.join(usable) or 'none'}")
         self.mounted = MountedCamera(mounts[config.camera], config.extrinsics, self.warn)
         self.dropped = 0

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -25,8 +26,13 @@ TERMINATION_TIMEOUT = 5  # of a worker after SIGTERM [s]
 ATTEMPTS = 3  # a run whose worker died so often is given up
 
 
+_working = threading.Event()  # this process, a worker, is at work
+
+
 def _on_terminate(*_: object) -> None:
-    """Raise SystemExit on SIGTERM, so that nodes are stopped on the way out; an alarm ends the process if that takes too long."""
+    """End on SIGTERM; at work by SystemExit, so that nodes are stopped on the way out, with an alarm if that takes too long."""
+    if not _working.is_set():
+        os._exit(1)
     signal.alarm(TERMINATION_TIMEOUT)
     sys.exit(1)
 
@@ -45,9 +51,12 @@ def prepare_worker() -> None:
 def _call(work: Callable[[T], R], item: T) -> R:
     """Do the work; SystemExit ends the process. The pool would take it for the work's result, and the worker would never end."""
     try:
+        _working.set()
         return work(item)
     except SystemExit:
         os._exit(1)
+    finally:
+        _working.clear()
 
 
 def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int | None = None, on_worker_death: Callable[[T], R] | None = None

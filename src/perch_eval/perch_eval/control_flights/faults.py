@@ -53,7 +53,7 @@ class Fault:
 def _stop_or_repeat_odometry(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     if rng.random() < 0.5:
         flight.loop.filters["controller", "odometry"] = lambda now, state: None
-        return "no odometry any more"
+        return "no further odometry"
     last = flight.mission.latest_odometry
     flight.loop.filters["controller", "odometry"] = lambda now, state: last
     return "the last sample again and again"
@@ -75,7 +75,7 @@ def _shift_position(flight: ScriptedFlight, rng: np.random.Generator) -> str:
 def _stop_vio(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     for channel in ("vio/state", "vio/odometry"):
         flight.loop.filters["estimator", channel] = lambda now, value: None
-    return "no VIO pose any more"
+    return "no further VIO pose"
 
 
 def _drop_trajectories(flight: ScriptedFlight) -> None:
@@ -84,7 +84,7 @@ def _drop_trajectories(flight: ScriptedFlight) -> None:
 
 def _stop_trajectories(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     _drop_trajectories(flight)
-    return "no trajectory any more"
+    return "no further trajectory"
 
 
 def _add_body_rate(flight: ScriptedFlight, rng: np.random.Generator) -> str:
@@ -132,8 +132,8 @@ def _abort(flight: ScriptedFlight, rng: np.random.Generator) -> str:
 FAULTS = (
     Fault("stale odometry", "odometry stops, or repeats its last sample", _stop_or_repeat_odometry),
     Fault("jumping odometry", "the position jumps by 0.3 to 2 m, for up to 1 s or for good", _shift_position),
-    Fault("lost VIO", "no VIO pose reaches the estimator any more", _stop_vio),
-    Fault("planner silence", f"no trajectory comes any more; `flight.silence_time` {SILENCE_TIME:g} s instead of 60 s", _stop_trajectories),
+    Fault("lost VIO", "no further VIO pose reaches the estimator", _stop_vio),
+    Fault("planner silence", f"no further trajectory is sent; `flight.silence_time` {SILENCE_TIME:g} s instead of 60 s", _stop_trajectories),
     Fault("excess tilt, rate", "a blow adds 8 to 20 rad/s about a random axis", _add_body_rate),
     Fault("low thrust margin", "all rotors weaken: the greatest thrust falls to 95 to 130 % of the weight", _weaken_rotors),
     Fault("geofence", "the fence is moved to between 0.3 m ahead of and 1.5 m behind the vehicle", _move_fence),

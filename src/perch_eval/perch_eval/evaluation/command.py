@@ -15,7 +15,7 @@ from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Section
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       both papers, 5 seeds a condition, 1 on lines
   python3 scripts/evaluate.py --seeds 20            20 seeds a condition
-  python3 scripts/evaluate.py --full --jobs 2       100 seeds, and what goes beyond the papers; interrupted, the same command goes on
+  python3 scripts/evaluate.py --full --jobs 2       100 seeds, and what goes beyond the papers; interrupted, the same command continues
   python3 scripts/evaluate.py --only m_planning     one part (m_planning, m_flights, p_powerline, p_flights, p_inspection,
                                                     p_cable, c_faults, c_comparison, c_way_out, c_contact, c_consistency)
 
@@ -91,4 +91,4 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
     return sections
 
 
-main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, the same command (without --fresh) goes on")
+main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, the same command (without --fresh) continues")

@@ -24,7 +24,7 @@ from perch_eval.revision import banner, code_version
 from perch_eval.rows import Rows, rows_of
 
 EXAMPLES = """examples:
-  python3 scripts/faults.py                                    all; interrupted or killed, the same command goes on;
+  python3 scripts/faults.py                                    all; interrupted or killed, the same command continues;
                                                                rows of other code are dropped first
   python3 scripts/faults.py --jobs 1                           one flight at a time
   python3 scripts/faults.py --most 20                          so many more
@@ -45,8 +45,8 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--only", default="", metavar="WORDS", help="cases with all of these words in their names")
     out.add_argument("--most", type=count, metavar="N", help="fly at most so many")
     out.add_argument("--jobs", type=count, default=len(os.sched_getaffinity(0)), metavar="N", help="flights in lockstep at a time (default: %(default)s)")
-    out.add_argument("--again", action="store_true", help="fly what has been flown, too")
-    out.add_argument("--page", action="store_true", help="fly nothing")
+    out.add_argument("--again", action="store_true", help="also repeat cases that have a result")
+    out.add_argument("--page", action="store_true", help="write the page only, fly nothing")
     return out
 
 
@@ -183,4 +183,4 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(text) + "\n"
 
 
-main = command(parser, _run, ValueError, interrupted="interrupted; what has been flown is kept, the same command goes on")
+main = command(parser, _run, ValueError, interrupted="interrupted; what has been flown is kept, the same command continues")

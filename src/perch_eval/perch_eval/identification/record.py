@@ -12,7 +12,7 @@ from perch_eval.flight import Flight, interpolated
 
 MIN_DURATION = 5.0    # of a record in the air [s]
 AIRBORNE_SHARE = 0.6  # specific force along b3 in flight, as a share of gravity
-SKIPPED_START = 1.5   # from take-off until the ground has no effect any more [s]
+SKIPPED_START = 1.5   # from take-off until the ground has no further effect [s]
 
 
 @dataclass(frozen=True)

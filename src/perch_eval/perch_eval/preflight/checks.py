@@ -180,7 +180,7 @@ def camera_rotation(turned_B: np.ndarray, turned_C: np.ndarray) -> tuple[np.ndar
 
 
 def check_rotation(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehicle) -> Check:
-    """Check the rotation between a camera and the IMU, and the gyroscope's scale, while the vehicle is shaken by hand.
+    """Check the rotation between a camera and the IMU, and the gyroscope's scale, while the vehicle is rotated by hand.
 
     `turned_B` and `turned_C` are those of `camera_rotation`.
     """
@@ -202,7 +202,7 @@ def check_rotation(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicl
     residual = float(np.linalg.norm(turned_B - scale * camera_rates) / np.linalg.norm(turned_B))
     if residual > MAX_RESIDUAL:
         return Check(title, Verdict.FAILED, f"{100 * residual:.0f} % of the gyroscope's rates are not the camera's",
-                     "an axis of the gyroscope has another scale, the clocks differ, or the scene moves: check these, and shake again")
+                     "an axis of the gyroscope has another scale, the clocks differ, or the scene moves: check these, and repeat")
     off = degrees(float(np.linalg.norm(so3.log(vehicle.mounts[name].R_BC.T @ R))))
     return make_check(title, off < MAX_ROTATION_ERROR, f"{off:.1f} deg from the file",
                       f"R_BC is about {np.round(R, 2).tolist()}: correct `orientation` in the vehicle file, or the IMU's axes")

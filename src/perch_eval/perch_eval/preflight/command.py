@@ -19,9 +19,9 @@ from perch_eval.preflight.checks import Check, Verdict
 
 EXAMPLES = """examples:
   python3 scripts/preflight.py --vehicle mine.yaml                     listen for 5 s to a vehicle that stands still on its feet
-  python3 scripts/preflight.py --vehicle mine.yaml --shake down        then shake it by hand: rotation between camera and IMU
+  python3 scripts/preflight.py --vehicle mine.yaml --shake down        then rotate it by hand: rotation between camera and IMU
   python3 scripts/preflight.py --vehicle mine.yaml --props-off         then arm, disarm and kill: NO PROPELLERS MAY BE MOUNTED
-  python3 scripts/preflight.py --vehicle mine.yaml --props-off --takeover   then wait until the pilot takes over by his switch
+  python3 scripts/preflight.py --vehicle mine.yaml --props-off --takeover   then wait until the pilot takes over by the switch
   python3 scripts/preflight.py --vehicle mine.yaml --props-off --watchdog   then wait until you stop the controller, and check that the motors stop
 
 exit code: 0 nothing has failed, 1 something has, 2 wrong arguments"""
@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--namespace", default="", help="namespace of its nodes")
     out.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
     out.add_argument("--shake", choices=("down", "front"),
-                     help="camera whose rotation to the IMU is checked; shake the vehicle for 10 s when asked")
+                     help="camera whose rotation to the IMU is checked; rotate the vehicle by hand for 10 s when asked")
     out.add_argument("--props-off", action="store_true", help="no propellers are mounted: the motors may be started")
     out.add_argument("--takeover", action="store_true", help="with --props-off: the pilot will take over, with the pilot's arming switch off")
     out.add_argument("--watchdog", action="store_true", help="with --props-off: the controller will be stopped by hand")
@@ -66,11 +66,11 @@ def passive_checks(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]
 
 
 def rotation_check(listener: Any, vehicle: Vehicle, camera: str | None, sensors: str) -> Check:
-    """Ask for the vehicle to be shaken and check the rotation between camera and IMU; without a camera it is not exercised."""
+    """Ask for the vehicle to be rotated and check the rotation between camera and IMU; without a camera it is not exercised."""
     turned = np.zeros((0, 3)), np.zeros((0, 3))
     if camera:
         listener.subscribe_camera(camera, vehicle.mounts[camera].camera)
-        print("shake the vehicle about all axes for 10 s ...", flush=True)
+        print("rotate the vehicle back and forth about all axes for 10 s ...", flush=True)
         listener.spin_for(10.0)
         imu = imu_in_body(listener, sensors)
         turned = listener.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3),
@@ -104,6 +104,9 @@ def active_checks(listener: Any, arguments: argparse.Namespace, bound: float = c
 
 def _check(arguments: argparse.Namespace) -> int:
     """Receive data, check them, and print the verdicts."""
+    for name in ("takeover", "watchdog"):
+        if getattr(arguments, name) and not arguments.props_off:
+            raise PerchError(f"--{name} starts the motors: it needs --props-off")
     if not 1.0 <= arguments.listen <= 300.0:
         raise PerchError(f"--listen: {arguments.listen:g} is outside [1, 300] s")
     vehicle = load_vehicle(arguments.vehicle)

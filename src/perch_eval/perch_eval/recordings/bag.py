@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any
@@ -55,15 +55,16 @@ class BagRecording(Recording):
             self._cameras = {_camera_name(topic): topic for topic in sorted(pictures)}
             self._imu = imus[0] if imus else ""
         else:
-            found = {name: _topic(camera.topic or f"camera_{name}/image_raw", pictures) for name, camera in sensors.cameras.items()}
+            found = {name: _topic((camera.topic, f"camera_{name}/image_raw"), pictures) for name, camera in sensors.cameras.items()}
             self._cameras = {name: topic for name, topic in found.items() if topic}
             if not self._cameras:
                 raise RecordingError(
-                    f"{path}: none of the cameras' topics of {sensors.name}; images are on: {', '.join(sorted(pictures)) or 'none'}")
-            requested = sensors.imu.topic or "imu/data_raw" if sensors.imu is not None else ""
-            self._imu = _topic(requested, set(imus)) if requested else ""
-            if requested and not self._imu:
-                raise RecordingError(f"{path}: no IMU on {requested}; there are: {', '.join(imus) or 'none'}")
+                    f"{path}: none of the cameras' topics (`topic`, or camera_<name>/image_raw) of sensor file {sensors.name}; images are on: "
+                    f"{', '.join(sorted(pictures)) or 'none'}")
+            self._imu = _topic((sensors.imu.topic, "imu/data_raw"), set(imus)) if sensors.imu is not None else ""
+            if sensors.imu is not None and not self._imu:
+                raise RecordingError(f"{path}: no IMU on {sensors.imu.topic or 'imu/data_raw'} (`topic` of the IMU in sensor file {sensors.name}) "
+                                     f"or imu/data_raw; there are: {', '.join(imus) or 'none'}")
         self.images = {name: counts[topic] for name, topic in self._cameras.items()}
         self.samples = counts[self._imu] if self._imu else 0
 
@@ -153,12 +154,13 @@ def _numbers(pose: Any) -> tuple[float, ...]:
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
-def _topic(requested: str, available: set[str]) -> str:
-    """Return the available topic that matches the wanted one, up to slash, namespace and `/compressed`; empty if none does."""
-    end = "/" + requested.lstrip("/")
-    names = (end, f"{end}/compressed")
-    exact = [topic for topic in names if topic in available]
-    return (exact or [topic for topic in sorted(available) if topic.endswith(names)] or [""])[0]
+def _topic(requested: Iterable[str], available: set[str]) -> str:
+    """Return the available topic that matches the first possible one, up to slash, namespace and `/compressed`; empty if none does."""
+    for topic in filter(None, requested):
+        names = (end := "/" + topic.lstrip("/"), f"{end}/compressed")
+        if found := [one for one in names if one in available] or [one for one in sorted(available) if one.endswith(names)]:
+            return found[0]
+    return ""
 
 
 def _camera_name(topic: str) -> str:

@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     read.add_argument("files", nargs="+", type=Path, metavar="FILE",
                       help="kalibr: camchain-imucam.yaml [imu.yaml]; euroc: the recording's folder")
     read.add_argument("--out", type=Path, metavar="FILE", help="where to write (default: the terminal)")
-    read.add_argument("--name", help="name of the sensors (default: that of the file)")
+    read.add_argument("--name", help="name of the sensors (default: that of the file that is written)")
     read.add_argument("--rename", nargs="+", default=[], metavar="OLD=NEW", help="names of the cameras, as cam0=down")
     read.add_argument("--imu-orientation", nargs=4, type=float, default=(0.0, 0.0, 0.0, 1.0), metavar=("X", "Y", "Z", "W"),
                       help="axes of the IMU in the body (forward, left, up), as a quaternion (default: the body has the IMU's axes)")
@@ -57,7 +57,7 @@ def _import(args: argparse.Namespace) -> int:
     if args.kind == "kalibr":
         if len(args.files) > 2:
             raise ConfigError("import kalibr", str(args.files[2]), "is one file too many: camchain-imucam.yaml [imu.yaml]")
-        sensors = from_kalibr(first, args.files[1] if len(args.files) > 1 else None, args.name or first.stem, R_BI)
+        sensors = from_kalibr(first, args.files[1] if len(args.files) > 1 else None, args.name or (args.out or first).stem, R_BI)
     else:
         root = root_of(first)
         if root is None or len(args.files) > 1:

@@ -112,12 +112,10 @@ def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path) -> 
         path: ends in .gif or .mp4.
 
     Raises:
-        PerchError: another ending, or OpenCV has no encoder for MP4.
+        PerchError: OpenCV has no encoder for MP4.
     """
-    writers = {".gif": _write_gif, ".mp4": _write_mp4}
-    if path.suffix.lower() not in writers:
-        raise PerchError(f"{path}: the ending is none of .gif, .mp4 and .png")
-    writers[path.suffix.lower()](path, fps, with_progress(_frames(scene, times), len(times), unit="frames"))
+    write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    write(path, fps, with_progress(_frames(scene, times), len(times), unit="frames"))
 
 
 def _frames(scene: Scene, times: np.ndarray) -> Iterator[np.ndarray]:

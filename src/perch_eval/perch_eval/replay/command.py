@@ -32,7 +32,7 @@ exit code: 0 written, 2 invalid input (no such recording, nothing in it)"""
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     out = command_parser("replay.py", __doc__, EXAMPLES)
-    out.add_argument("flight", type=Path, metavar="FLIGHT.mcap", help="recording (demo.py, recorder, a campaign's kept flight)")
+    out.add_argument("flight", type=Path, metavar="FLIGHT.mcap", help="recording (demo.py, recorder, a campaign's kept flight), or a folder with flight.mcap")
     out.add_argument("--out", type=Path, metavar="FILE", help="animation, .gif or .mp4, or a stroboscopic picture, .png (default: FLIGHT.gif)")
     out.add_argument("--plots", type=Path, metavar="DIR", help="also write the plots here, as PNG")
     out.add_argument("--from", dest="start", type=float, metavar="S", help=f"begin (default: {BEFORE:g} s before the perch)")
@@ -49,11 +49,14 @@ def _show(args: argparse.Namespace) -> int:
     for name in ("fps", "speed"):
         if not 0.0 < getattr(args, name) < np.inf:
             raise PerchError(f"--{name} {getattr(args, name):g} is not a number > 0")
-    flight = read_flight(args.flight, args.namespace)
+    recording = args.flight / "flight.mcap" if args.flight.is_dir() else args.flight
+    path = args.out or recording.with_suffix(".gif")
+    if path.suffix.lower() not in (".gif", ".mp4", ".png"):
+        raise PerchError(f"{path}: the ending is none of .gif, .mp4 and .png")
+    flight = read_flight(recording, args.namespace)
     flight.known_states("ground_truth/odometry")
     vehicle = identify_vehicle(flight, {} if args.vehicle else read_report(flight), args.vehicle)
     view = FlightView.from_flight(flight, vehicle or load_vehicle("snapdragon"))
-    path = args.out or args.flight.with_suffix(".gif")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".png":
         start, end = span(view, args.start, args.end, 0.0, 0.0)
