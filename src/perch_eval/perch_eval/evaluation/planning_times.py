@@ -108,7 +108,7 @@ def _figure(effort: Effort, vehicle: Vehicle) -> Section:
     axes.legend(fontsize=8)
     figure.savefig(effort.out / "m_fig_4.png", dpi=110)
     out.figures.append(("m_fig_4.png", "Thrust over time in each iteration"))
-    falls = all(b < a for a, b in zip(peaks, peaks[1:]))
+    falls = all(b < a for a, b in zip(peaks, peaks[1:])) if len(peaks) > 1 else None
     out.claim("peak thrust in each iteration", " > ".join(f"{p:.2f}" for p in peaks) + " N", "shrinks in each", falls,
               "each iteration has a lower peak")
     out.claim("peak of the last iteration", f"{peaks[-1]:.3f} N", f"<= {bound:g} N", found.solved and peaks[-1] <= bound,
