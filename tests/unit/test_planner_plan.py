@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -175,6 +175,18 @@ def test_minimum_time_is_shorter_and_still_verifies():
     assert shortest.duration < 0.9 * usual.duration
 
 
+def test_minimum_time_also_shortens_a_plan_with_a_fine_division():
+    problem = random_problem(np.random.default_rng(254))
+    usual, shortest = checked(problem), checked(problem, PerchSettings(minimum_time=True))
+    assert usual.trajectory.durations[-1] < 0.3 and shortest.duration < 0.95 * usual.duration
+
+
+@pytest.mark.parametrize("guess", [(0.01, 1.0), (0.05, 1.2), (0.2, 1.2)])
+def test_a_first_guess_that_is_far_too_short_leads_to_no_longer_plan_than_none(guess):
+    problem = PerchProblem(HOVER, surface(80.0), (Waypoint((0.8, 0.0, 1.5)),))
+    assert checked(replace(problem, segment_times=guess)).duration <= checked(problem).duration
+
+
 def test_certificates_enclose_what_dense_sampling_finds():
     planned = checked(PerchProblem(StartState(HOVER.p, yaw=0.6), surface(90.0)), PerchSettings(contact_delay=0.03))
     proofs = {c.quantity: c for c in planned.certificates}
@@ -198,6 +210,7 @@ def test_certificates_enclose_what_dense_sampling_finds():
     (PerchProblem(HOVER, surface(90.0, p=(-1.0, 0.0, 1.5))), {}, refusals.BOX),
     (PerchProblem(StartState((0.0, 0.0, 0.05)), surface(90.0)), {}, refusals.BOX),
     (PerchProblem(StartState((0.0, 0.0, 1.5), a=(0.0, 0.0, -9.0)), surface(90.0)), {}, refusals.BAD_INPUT),
+    (PerchProblem(StartState((0.0, 0.0, 1.5), a=(0.0, 6.0, -9.81)), surface(90.0)), {}, refusals.BAD_INPUT),  # thrust along b2_des
 ])
 def test_refusals_name_the_constraint_and_its_margin(problem, settings, code):
     with pytest.raises(PerchRefusal) as caught:
@@ -250,7 +263,8 @@ def test_a_refusal_for_a_waypoint_whose_rim_touches_a_wall_names_the_clearance_t
     with pytest.raises(PerchRefusal, match="clearance") as caught:
         plan(problem, PerchSettings(), VEHICLE)
     assert -0.3 < caught.value.relaxed["clearance_min"] < 0.0
-    assert -np.inf < next(c for c in caught.value.certificates if c.quantity == "clearance").minimum < 0.0
+    clearance = next(c for c in caught.value.certificates if c.quantity == "clearance")
+    assert -np.inf < clearance.minimum < 0.0 and clearance.method == "dense"
     assert all(c.holds for c in plan(problem, PerchSettings(**caught.value.relaxed), VEHICLE).certificates)
 
 
@@ -305,6 +319,25 @@ def test_a_refusal_names_the_fewest_limits_and_values_that_do(settings, names, w
         plan(problem, PerchSettings(**settings), VEHICLE)
     assert set(caught.value.relaxed) == names and caught.value.margin < 0.0
     checked(problem, PerchSettings(**settings | caught.value.relaxed))
+
+
+def test_a_plan_that_a_search_without_a_limit_finds_is_taken_where_it_keeps_the_limit():
+    settings = PerchSettings(speed_max=2.8, duration_max=3.8433, tube_time=0.004, contact_delay=0.01, clearance_min=-0.0018)
+    assert checked(random_problem(np.random.default_rng(50117)), settings).duration < 3.0
+
+
+def test_values_that_remove_limits_are_valid_settings():
+    ranges = {field.name: field.metadata for field in fields(PerchSettings)}
+    for name, limit in relaxation._LIMITS.items():
+        assert ranges[name]["low"] is None or ranges[name]["low"] <= limit.unlimited
+        assert limit.unlimited <= ranges[name]["high"]
+    assert relaxation._LIMITS["thrust_max"].unlimited == ranges["thrust_max"]["high"]
+
+
+def test_a_rotor_margin_above_zero_is_reduced_to_zero_at_most_where_this_suffices():
+    with pytest.raises(PerchRefusal) as caught:
+        plan(PerchProblem(HOVER, surface(90.0)), PerchSettings(rotor_margin=0.4), VEHICLE)
+    assert caught.value.relaxed["rotor_margin"] >= 0.0
 
 
 @pytest.mark.parametrize("seed", [20010, 20063])

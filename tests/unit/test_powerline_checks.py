@@ -159,6 +159,7 @@ def test_a_guess_with_the_line_in_view_turns_to_the_side_it_looks_to(yaw: float)
     (dict(target_line=9), "empty_map", "target line 9"),
     (dict(lines=(LINE, Segment([4.0, 0, 4.2], [1, 0, 0], 2.0, 0.03, 5))), "bad_input", "lines 0 and 5 cross"),
     (dict(lines=(LINE, Segment([9.0, 0, 4.2], [0, 1, 0], 2.0, 0.03, 0))), "bad_input", "same id"),
+    (dict(recovery_only=True, lines=(LINE, Segment([9.0, 0, 4.2], [0, 1, 0], 2.0, 0.03, 0))), "bad_input", "same id"),
     (dict(start=hover_state(MODEL, np.array([0.0, 0, 0.5]), LEVEL)), "start_invalid", "0.500 m is below height_min 0.8 m"),
     (dict(start=hover_state(MODEL, np.array([4.0, 0, 4.3]), LEVEL)), "start_invalid", "line 0 is nearer than the body"),
     (dict(start=hover_state(MODEL, np.array([0.0, 0, 4.3]), np.array([0, 0, 1.0, 0]))), "bad_input", "behind the vehicle"),

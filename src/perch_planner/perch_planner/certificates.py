@@ -12,6 +12,9 @@ from perch_planner.contact_constraints import INSET
 from perch_planner.problem import Limits
 from perch_planner.search import Outcome, Search
 
+_SAMPLED = ("clearance", "body_rate", "rotor_thrust")
+"""Quantities whose extrema are those of samples where their limits do not hold."""
+
 
 def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Certificate, ...]:
     """Convert results of `plan_checks.check` into certificates.
@@ -28,6 +31,8 @@ def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Cert
     out = []
     for quantity, row, (unit, low, high, scale, method) in zip(plan_checks.NAMES, results.tolist(), table):
         minimum, at_minimum, maximum, at_maximum, holds = row
+        if not holds and quantity in _SAMPLED:
+            method = "dense"
         out.append(Certificate(quantity=quantity, unit=unit, lower_limit=low, upper_limit=high, minimum=scale * minimum,
                                maximum=scale * maximum, time_of_minimum=at_minimum, time_of_maximum=at_maximum, method=method,
                                holds=bool(holds)))

@@ -63,10 +63,9 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pe
     limits = Limits.of(settings, vehicle)
     refusals.check_feasibility(problem, settings, limits, vehicle)
     search = Search(problem, settings, vehicle, limits)
-    durations, outcome = search.run()
-    if not outcome.proved:
-        raise relaxation.refusal(search, outcome)
-    if settings.minimum_time:
-        outcome = search.shortest(durations, outcome)
+    found = search.run()
+    if not found.outcome.proved:
+        found = relaxation.found_by_trial(search, found.outcome)
+    outcome = search.shortest(found) if settings.minimum_time else found.outcome
     trajectory = FlatTrajectory(outcome.durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
     return PerchPlan(trajectory, perch_certificates(search, outcome), search.iterations, perf_counter() - begin, tuple(search.attempts))

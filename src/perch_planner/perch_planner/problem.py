@@ -105,7 +105,8 @@ class PerchProblem:
         surface: the surface at time 0; the vehicle ends at perch_offset in front of its centre, with b3 = s3.
         waypoints: positions to pass, in order; in W, also for a moving target.
         target_velocity: constant velocity of the surface in W [m/s], shape (3,).
-        segment_times: first guess of the segment durations [s], one more than waypoints; None: chosen by the planner.
+        segment_times: first guess of the segment durations [s], one more than waypoints; None: chosen by the planner, which also
+            replaces guesses to waypoints that are far too short.
     """
 
     start: StartState
@@ -169,7 +170,7 @@ class PerchSettings(PerchParameters):
     """
 
     impact_acceleration_fixed: bool = quantity(False, doc="impact_acceleration also for surfaces that face up, for which it is raised otherwise")
-    thrust_max: float = quantity(0.0, unit="N", low=0.0, doc="tau_max of [M:eq16]; 0: thrust_reserve x the vehicle's")
+    thrust_max: float = quantity(0.0, unit="N", low=0.0, high=4e3, doc="tau_max of [M:eq16]; 0: thrust_reserve x the vehicle's")
     thrust_min: float = quantity(0.0, unit="N", low=0.0, doc="tau_min of [M:eq16]; 0: the vehicle's")
     body_rate_max: float = quantity(0.0, unit="rad/s", low=0.0, doc="bound on |omega|; 0: the vehicle's")
     objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import hypot, sqrt
+from math import cos, hypot, sin, sqrt
 
 from perch_core.arrays import Array
 from perch_core.errors import PlanningRefusal
@@ -15,6 +15,7 @@ from perch_planner.body_rate_bound import squared_rate
 from perch_planner.clearance_bound import PLATE_SLACK
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 
+_HEADING_SINE_MIN = 1e-6  # of the angle between the thrust and b2_des, as in `perch_core.flatness`
 _ROUNDING = 1e-6  # of a start that is a state of a plan at its limit
 BAD_INPUT = "bad_input"
 UNREACHABLE_TILT = "unreachable_tilt"
@@ -43,7 +44,7 @@ class PerchRefusal(PlanningRefusal):
 @compiled
 def _precheck_quantities(points: Array, a: Array, j: Array, yaw: float, yaw_rate: float, R_WS: Array, extension: float, offset: float,
                          moving: bool, low_height: float, high_height: float, nearest: float
-                         ) -> tuple[float, float, float, float, int, float, int, float, float]:
+                         ) -> tuple[float, float, float, float, float, int, float, int, float, float]:
     """Quantities of a plan that its start and its points determine.
 
     Args:
@@ -55,12 +56,13 @@ def _precheck_quantities(points: Array, a: Array, j: Array, yaw: float, yaw_rate
         low_height, high_height, nearest: limits; the last is that of the distance of a waypoint from the surface's plane [m].
 
     Returns:
-        (specific thrust of the start [m/s^2], its body rate [rad/s], reach of the rim towards the surface at the start [m],
+        (specific thrust of the start [m/s^2], sine of the angle between it and b2_des, its body rate [rad/s], reach of the rim towards the surface at the start [m],
         distance of the start from the surface's plane [m], first point whose height is out of range and that height [m], first
         waypoint too near to the plane and its distance [m], least path length to the contact [m]); points are -1 for none.
     """
     x, y, z = a[0], a[1], a[2] + GRAVITY
     specific, rate = sqrt(x * x + y * y + z * z), sqrt(squared_rate(x, y, z, j[0], j[1], j[2], yaw, yaw_rate))
+    heading_sine = sqrt(z * z + (x * cos(yaw) + y * sin(yaw)) ** 2) / max(specific, 1e-9)
     cosine = min(abs(x * R_WS[0, 2] + y * R_WS[1, 2] + z * R_WS[2, 2]) / max(specific, 1e-9), 1.0)
     last, out_of_range, too_near = len(points) - 1, -1, -1
     start = height = distance = 0.0
@@ -78,7 +80,7 @@ def _precheck_quantities(points: Array, a: Array, j: Array, yaw: float, yaw_rate
             start = plane_distance
         elif k < last and too_near < 0 and plane_distance <= nearest:
             too_near, distance = k, plane_distance
-    return specific, rate, extension * sqrt(1.0 - cosine * cosine), start, out_of_range, height, too_near, distance, path_length
+    return specific, heading_sine, rate, extension * sqrt(1.0 - cosine * cosine), start, out_of_range, height, too_near, distance, path_length
 
 
 def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Limits, vehicle: Vehicle) -> None:
@@ -107,7 +109,7 @@ def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Li
     start, surface = problem.start, problem.surface
     plate = limits.perch_offset + min(limits.clearance, 0.0) - PLATE_SLACK
     least = max(limits.clearance, plate)
-    specific, rate, rim, distance, out_of_range, height, too_near, waypoint_distance, path_length = _precheck_quantities(
+    specific, heading_sine, rate, rim, distance, out_of_range, height, too_near, waypoint_distance, path_length = _precheck_quantities(
         problem.points, start.a, start.j, start.yaw, start.yaw_rate, surface.R_WS, limits.extension, vehicle.perch_offset, bool(problem.target_velocity[2]),
         *limits.height, least)
     specific *= vehicle.mass
@@ -115,6 +117,9 @@ def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Li
         raise PerchRefusal(BAD_INPUT, "thrust of the start state within [tau_min, tau_max] [M:eq16]",
                            min(specific - low, high - specific),
                            f"the start state requires {specific:.3f} N, outside [{low:.3f}, {high:.3f}] N")
+    if heading_sine < _HEADING_SINE_MIN:
+        raise PerchRefusal(BAD_INPUT, "heading of the start state [M:eq12]", heading_sine - _HEADING_SINE_MIN,
+                           "the thrust of the start state points along b2_des = (-sin yaw, cos yaw, 0), where the yaw defines no attitude")
     if rate > (1.0 + _ROUNDING) * limits.body_rate:
         raise PerchRefusal(BODY_RATE, "body rate of the start state [M:eq13]", limits.body_rate - rate,
                            f"the body rate of the start state is {rate:.1f} rad/s, more than body_rate_max {limits.body_rate:g} rad/s")

@@ -4,6 +4,7 @@ Only limits that influenced the search can be the cause: the search is the same 
 suffice are removed one at a time: first those that a caller can change, then the range of the single rotors, which binds before
 other limits of the vehicle. Where no single one suffices, all are removed, and restored one by one where a plan keeps them (the
 deletion filter of Chinneck and Dravnieks, 1991). Bisection reduces the relaxation. The reported values are kept by a plan.
+Where a plan without some limits keeps all of them, as a search under them may miss it, it is the result.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from perch_planner.certificates import perch_certificates
 from perch_planner.plan_checks import MAXIMUM, MINIMUM
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
-from perch_planner.search import Outcome, Search
+from perch_planner.search import Found, Outcome, Search
 
 PROGRAMS_MAX = 300
 """Greatest number of quadratic programs in all searches with relaxed limits."""
@@ -49,9 +50,9 @@ _LIMITS = {
     "height_min": _Limit(-1e4, refusals.BOX, "height limits", "m"),
     "height_max": _Limit(1e4, refusals.BOX, "height limits", "m"),
     "duration_max": _Limit(600.0, refusals.BOX, "duration_max", "s"),
-    "speed_max": _Limit(1e3, refusals.BOX, "speed limit", "m/s"),
+    "speed_max": _Limit(100.0, refusals.BOX, "speed limit", "m/s"),
     "rotor_margin": _Limit(-1e3, refusals.THRUST_FLOOR, "thrust range of the single rotors"),
-    "thrust_max": _Limit(1e3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
+    "thrust_max": _Limit(4e3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
     "thrust_min": _Limit(1e-3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
     "body_rate_max": _Limit(1e3, refusals.BODY_RATE, "body-rate limit", "rad/s"),
     "clearance_min": _Limit(-1e3, refusals.BOX, "clearance from the surface until contact", "m"),
@@ -60,23 +61,30 @@ _LIMITS = {
 _SINGLE_LIMITS = ("height_min", "height_max", "duration_max", "speed_max", "rotor_margin")  # tried one at a time
 
 
-def refusal(search: Search, best: Outcome) -> PerchRefusal:
-    """Return a refusal that explains why a search found no plan.
+def found_by_trial(search: Search, best: Outcome) -> Found:
+    """Return a plan that keeps all limits, if a search without some of them finds one.
 
     Args:
         search: the finished search.
         best: the outcome that `Search.run` returned.
 
-    Returns:
-        A refusal whose `relaxed` holds settings that admit a plan; it is empty where none was found even without limits.
+    Raises:
+        PerchRefusal: there is none; `relaxed` holds settings that admit a plan, and is empty where none was found even without limits.
     """
+    trials = _Trials(search, _requested(search.settings, search.limits))
+    relaxed_limits = trials.relaxation()
+    if trials.kept is None:
+        raise _refusal(search, best, trials.requested, relaxed_limits)
+    return trials.kept
+
+
+def _refusal(search: Search, best: Outcome, requested: dict[str, float], relaxed_limits: dict[str, float] | None) -> PerchRefusal:
+    """Return the refusal that explains why a search found no plan."""
     settings, vehicle = search.settings, search.vehicle
-    requested = _requested(settings, Limits.of(settings, vehicle))
     proofs = perch_certificates(search, best)
     longest = max((attempt.duration for attempt in search.attempts), default=0.0)
     tried = f"{search.iterations} programs up to {longest:.2f} s"
     least, most = vehicle.thrust_min, vehicle.thrust_max
-    relaxed_limits = _Trials(search, requested).relaxation()
     if relaxed_limits is None and (guess := float(search.initial_durations.sum())) > settings.duration_max:
         return PerchRefusal(refusals.BOX, "duration_max", settings.duration_max - guess,
                             f"no plan within duration_max {settings.duration_max:g} s ({tried}), where the first guess is {guess:.2f} s, nor without "
@@ -119,19 +127,27 @@ class _Trials:
     """Searches with relaxed limits, bounded by their total number of programs."""
 
     def __init__(self, search: Search, requested: dict[str, float]) -> None:
-        self._search, self._requested, self._programs_left = search, requested, PROGRAMS_MAX
+        self._search, self.requested, self._programs_left = search, requested, PROGRAMS_MAX
+        self.kept: Found | None = None
+        """A plan of a trial that keeps all requested limits; it ends the trials."""
         self._tried: dict[frozenset[str], dict[str, float] | None] = {}
 
     def _usage_under(self, changes: dict[str, Any]) -> dict[str, float] | None:
         """Return what a plan under changed settings uses of each limit; None where a short search finds no plan."""
-        if not changes or self._programs_left <= 0:
+        if not changes or self._programs_left <= 0 or self.kept is not None:
             return None
         settings = replace(self._search.settings, minimum_time=False, **changes)
         trial = Search(self._search.problem, settings, self._search.vehicle, Limits.of(settings, self._search.vehicle),
                        min(_PROGRAMS_PER_TRIAL, self._programs_left))
-        _, outcome = trial.run()
+        found = trial.run()
         self._programs_left -= trial.iterations
-        return _limit_usage(trial.problem, outcome, trial.vehicle) if outcome.proved else None
+        if not found.outcome.proved:
+            return None
+        used = _limit_usage(trial.problem, found.outcome, trial.vehicle)
+        # A slip within its limit on time may not be so for a late contact.
+        if "tangential_speed_max" not in changes and not self._violated(_LIMITS, used):
+            self.kept = found
+        return used
 
     def _usage_without(self, names: Iterable[str]) -> dict[str, float] | None:
         """Return what a plan without some limits uses of each limit; None where a short search finds no plan."""
@@ -162,13 +178,15 @@ class _Trials:
 
     def _violated(self, names: Iterable[str], used: dict[str, float]) -> list[str]:
         """Return the limits whose requested values a plan violates."""
-        return [n for n in names if (used[n] - self._requested[n]) * (_LIMITS[n].unlimited - self._requested[n]) > 0.0]
+        return [n for n in names if (used[n] - self.requested[n]) * (_LIMITS[n].unlimited - self.requested[n]) > 0.0]
 
     def relaxation(self) -> dict[str, float] | None:
         """Return values of limits that admit a plan, as near to the requested ones as bisection finds; None: none exist."""
         if (smallest := self._smallest_removal()) is None:
             return None
         names, used = smallest
+        if names == ["rotor_margin"] and self.requested["rotor_margin"] > 0.0 > used["rotor_margin"] and (found := self._usage_under({"rotor_margin": 0.0})):
+            used = found | {"rotor_margin": 0.0}  # within the range of the rotors: the plan without any range takes more than is needed
         values, low, high, share = self._relaxed_limits(names, used, 1.0), _SHARE_MIN, 2.0, 1.0  # under a limit a plan may need more than it took without
         for _ in range(_VALUE_TRIALS):
             tried = self._relaxed_limits(names, used, share)
@@ -183,7 +201,7 @@ class _Trials:
         """Return limits relaxed by a share of the excess of a plan over them; 1 covers all of it."""
         values = {}
         for name in names:
-            requested, unlimited = self._requested[name], _LIMITS[name].unlimited
+            requested, unlimited = self.requested[name], _LIMITS[name].unlimited
             values[name] = sorted((requested, _round_away(requested, requested + share * (used[name] - requested)), unlimited))[1]
         return values
 

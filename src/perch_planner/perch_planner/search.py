@@ -26,6 +26,7 @@ _EARLY_STRETCHES = 5      # so often, peaks are stretched where a longer time he
 _SMALL_VIOLATION = 0.03   # violations of the thrust range below this share are cut together with the other limits
 _DEFAULT_STRETCH = 1.15
 _BISECTIONS = 12
+_SHORTENING_MAX = 100     # quadratic programs
 _COARSE_TRIALS = 3        # so many durations are tried with few last pieces first, which cost least; from the last of them on with all divisions
 _SMALL_STEPS = 6          # so often the approach becomes a quarter longer, then by more
 _APPROACH_GROWTH = (1.25, 1.6)
@@ -59,6 +60,20 @@ class Outcome(NamedTuple):
     proved: bool = False
     stretch: float = _DEFAULT_STRETCH
     extrema: np.ndarray | None = None
+
+
+class Found(NamedTuple):
+    """Result of a search.
+
+    Attributes:
+        durations: of the problem's segments [s], shape (waypoints + 1,).
+        fails: number of divisions of the approach that failed, which determines the last division.
+        outcome: result for these durations, divided.
+    """
+
+    durations: np.ndarray
+    fails: int
+    outcome: Outcome
 
 
 def division_index(fails: int) -> int:
@@ -153,8 +168,8 @@ class Search:
                          "height_min": results[HEIGHT, MINIMUM] < floor, "height_max": results[HEIGHT, MAXIMUM] > ceiling}
         self.active_limits |= {name for name, is_violated in violated.items() if is_violated}
 
-    def run(self) -> tuple[np.ndarray, Outcome]:
-        """Search from each of the first durations in `STARTS` until every limit is proved; return the durations and the outcome.
+    def run(self) -> Found:
+        """Search from each of the first durations in `STARTS` until every limit is proved.
 
         From each, only longer durations are reached, in which the segments grow differently: where one start misses the durations
         that admit a plan, another may find them.
@@ -163,13 +178,13 @@ class Search:
         for factor, programs in STARTS:
             self._iterations_end = min(self.iterations + programs, self._iterations_max)
             found.append(self._run_from(with_last_segment(factor * self.initial_durations, self.settings)))
-            if found[-1][1].proved:
+            if found[-1].outcome.proved:
                 return found[-1]
             if self.iterations >= self._iterations_max:
                 break
         return found[0]
 
-    def _run_from(self, durations: np.ndarray) -> tuple[np.ndarray, Outcome]:
+    def _run_from(self, durations: np.ndarray) -> Found:
         """Lengthen durations until every limit is proved, or the time or the number of programs is exhausted. [M:IV-C.3]
 
         Where the thrust leaves its range before the last waypoint, all segments grow; otherwise mainly the approach, from the
@@ -182,11 +197,11 @@ class Search:
                 self.active_limits.add("duration_max")
                 fitted = None if at_maximum else shortened(durations, self.settings)
                 if fitted is None:
-                    return durations, best or Outcome(durations)
+                    return Found(durations, fails, best or Outcome(durations))
                 durations, at_maximum, fails = fitted, True, max(fails, _COARSE_TRIALS - 1)
             outcome = self.try_durations(divided_durations(durations, fails), allow_stretch=stretched < _EARLY_STRETCHES)
             if outcome.proved:
-                return durations, outcome
+                return Found(durations, fails, outcome)
             if best is None or len(outcome.results):
                 best = outcome
             if self.fails_early(durations, outcome):
@@ -196,7 +211,7 @@ class Search:
             else:
                 grown, stretched = lengthen_approach(durations, _APPROACH_GROWTH[stretched >= _SMALL_STEPS]), stretched + 1
             if self.iterations >= self._iterations_end:
-                return durations, best
+                return Found(durations, fails, best)
             durations = with_last_segment(grown, self.settings)
 
     def fails_early(self, durations: np.ndarray, outcome: Outcome) -> bool:
@@ -211,15 +226,22 @@ class Search:
         before = outcome.extrema[:len(durations) - 1]
         return bool(((before[:, 4] > self.high) | (before[:, 1] < self.low)).any())
 
-    def shortest(self, durations: np.ndarray, outcome: Outcome) -> Outcome:
-        """Bisect the scale of all durations for the shortest plan whose limits are still proved."""
+    def shortest(self, found: Found) -> Outcome:
+        """Bisect the scale of all durations for the shortest plan whose limits are still proved, in about `_SHORTENING_MAX` programs.
+
+        The approach is divided as in the plan that was found, or else coarsely.
+        """
+        durations, fails, outcome = found
+        self._iterations_end = self.iterations + _SHORTENING_MAX
         shortest = max(self.settings.tube_time, LAST_SEGMENT_MIN)
         low, high = min(shortest / durations[-1], 1.0), 1.0
         for _ in range(_BISECTIONS):
             if high - low < 1e-3 or self.iterations >= self._iterations_end:
                 break
             middle = 0.5 * (low + high)
-            tried = self.try_durations(split_last(middle * durations))
+            tried = self.try_durations(divided_durations(middle * durations, fails))
+            if not tried.proved and division_index(fails) < len(FINE_DIVISIONS):
+                tried = self.try_durations(split_last(middle * durations))
             if tried.proved:
                 high, outcome = middle, tried
             else:

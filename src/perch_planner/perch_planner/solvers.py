@@ -70,6 +70,7 @@ def _daqp(rows: Array, lower: Array, upper: Array, dual: Array | None) -> tuple[
     return np.asarray(w), "solved" if flag == 1 else f"exit flag {flag}", np.asarray(found["lam"])
 
 
+_ITERATIONS_MAX = 20000  # of OSQP for one tolerance
 _COARSE, _FINE = (1e-3, 1e-4, 1e-5, 1e-6), 1e-8  # tolerances of OSQP, one after the other
 
 
@@ -80,13 +81,13 @@ def _osqp(rows: Array, lower: Array, upper: Array, _: Array | None) -> tuple[Arr
     n = rows.shape[1]
     solver = osqp.OSQP()
     solver.setup(sparse.identity(n, format="csc"), np.zeros(n), sparse.csc_matrix(rows), lower, upper, verbose=False,
-                 eps_abs=_FINE, eps_rel=_FINE, eps_prim_inf=1e-9, max_iter=20000, polishing=True, scaling=0)
+                 eps_abs=_FINE, eps_rel=_FINE, eps_prim_inf=1e-6, max_iter=_ITERATIONS_MAX, polishing=True, scaling=0)
     for tolerance in (*_COARSE, _FINE):
         # Which rows are active shows long before the last digits, and polishing finds these from the rows.
         solver.update_settings(eps_abs=tolerance, eps_rel=tolerance)
         result = solver.solve(raise_error=False)
         polished = result.info.status_polish == 1 and max(result.info.prim_res, result.info.dual_res) < _FINE
-        if polished or "infeasible" in result.info.status:
+        if polished or "infeasible" in result.info.status or result.info.iter >= _ITERATIONS_MAX:  # finer tolerances take more
             break
     return np.asarray(result.x, float), str(result.info.status), None
 

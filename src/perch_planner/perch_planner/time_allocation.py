@@ -18,6 +18,7 @@ FINAL_TIME = 0.45          # [s] of the last piece, where the rotation happens
 FINE_DIVISIONS = (np.array([0.26, 0.2, 0.2]), np.array([0.375, 0.25]))  # [s] last pieces where the rotation takes all that the rotors have
 PIECE_MAX = 1.8           # [s] of the pieces before it
 APPROACH_TIME = 1.2       # [s] after the last waypoint, for run-up and rotation
+GUESS_SHARE_MIN = 0.8     # of the profile's duration to a waypoint: a shorter guess leads to longer plans in most cases
 SEGMENT_MIN = 0.12        # [s]; shorter ones make the cost ill-conditioned
 LAST_SEGMENT_MIN = 0.25   # [s]; a shorter rotation is often infeasible
 _ROUNDING = 1e-9           # [s] of sums
@@ -75,7 +76,9 @@ def _along_waypoints(points: Array, v_start: Array, v_end: Array, speed: float, 
 
 
 def allocate(problem: PerchProblem, settings: PerchSettings, points: np.ndarray) -> np.ndarray:
-    """Initial durations: those of the problem, or of a speed profile along the waypoints.
+    """Initial durations: those of a speed profile along the waypoints, or of the problem, where they are not far too short.
+
+    Durations only grow, all by one factor where a leg to a waypoint is too short: a short one would make all others long.
 
     Args:
         problem: start, waypoints, target velocity.
@@ -85,10 +88,13 @@ def allocate(problem: PerchProblem, settings: PerchSettings, points: np.ndarray)
     Returns:
         Durations [s], shape (len(waypoints) + 1,).
     """
-    if problem.segment_times is not None:
-        return with_last_segment(np.array(problem.segment_times), settings)
-    return _along_waypoints(points, problem.start.v, problem.target_velocity, CRUISE_SPEED, CRUISE_ACCELERATION,
-                            TURN_ACCELERATION, max(settings.tube_time, LAST_SEGMENT_MIN))
+    profile = _along_waypoints(points, problem.start.v, problem.target_velocity, CRUISE_SPEED, CRUISE_ACCELERATION,
+                               TURN_ACCELERATION, max(settings.tube_time, LAST_SEGMENT_MIN))
+    if problem.segment_times is None:
+        return profile
+    guess = np.array(problem.segment_times)
+    guess[:-1] = np.maximum(guess[:-1], GUESS_SHARE_MIN * profile[:-1])
+    return with_last_segment(guess, settings)
 
 
 def with_last_segment(durations: np.ndarray, settings: PerchSettings) -> np.ndarray:

@@ -34,6 +34,8 @@ def check_request(request: PowerlineRequest, vehicle: Vehicle, settings: Powerli
     norm = float(np.linalg.norm(request.start[Q]))
     if abs(norm - 1) > 1e-2:
         raise PlanningRefusal("bad_input", "start attitude", -abs(norm - 1), f"start quaternion has norm {norm:.4f}, not 1")
+    if len({line.id for line in request.lines}) < len(request.lines):
+        raise PlanningRefusal("bad_input", "line ids", -1.0, "two lines have the same id")
     if request.recovery_only:
         _check_start(request, vehicle, settings)
         return None  # a recovery starts at a line
@@ -57,8 +59,6 @@ def _check_finite(values: dict[str, np.ndarray]) -> None:
 
 def _check_crossings(lines: tuple[Segment, ...]) -> None:
     trimmed = {line.id: replace(line, half_length=max(line.half_length - END_TRIM, 1e-3)) for line in lines}
-    if len(trimmed) < len(lines):
-        raise PlanningRefusal("bad_input", "line ids", -1.0, "two lines have the same id")
     for a, b in combinations(trimmed.values(), 2):
         gap = segment_distance(a, b) - a.radius - b.radius
         if gap < 0 and abs(a.direction @ b.direction) < CROSSING_COSINE:
