@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from pathlib import Path
 from typing import Iterable
 
@@ -12,6 +13,8 @@ from .layout import EXTRAS, ROOT, SOURCES, STATE
 from .machine import Platform
 
 _FILE = STATE / "stamps.json"
+_IMPORT = re.compile(r"^from (perch_[\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
+_CONSTANT = re.compile(r"\b[A-Z_]{2,}\b")
 _BUILD_FILES = ("package.xml", "setup.py", "setup.cfg", "CMakeLists.txt")
 
 
@@ -42,9 +45,16 @@ def package_stamp(package: Path, environment: str) -> str:
 
 
 def kernel_stamp(environment: str) -> str:
-    """Return a stamp that changes with every file that holds compiled kernels."""
-    files = (file for file in sorted(SOURCES.rglob("*.py")) if b"@compiled" in file.read_bytes())
-    return _digest(files, environment)
+    """Return a stamp that changes with every file that holds compiled kernels, or constants that are imported for them."""
+    files = {file for file in SOURCES.rglob("*.py") if b"@compiled" in file.read_bytes()}
+    pending = list(files)
+    while pending:
+        for module, names in _IMPORT.findall(pending.pop().read_text()):
+            file = SOURCES.joinpath(module.split(".")[0], *module.split(".")).with_suffix(".py")
+            if _CONSTANT.search(names) and file not in files and file.exists():
+                files.add(file)
+                pending.append(file)
+    return _digest(sorted(files), environment)
 
 
 def packages(target: Platform) -> list[Path]:

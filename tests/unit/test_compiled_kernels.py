@@ -59,3 +59,30 @@ def test_numba_comes_with_the_first_call_and_what_is_compiled_is_loaded_without_
     for left in (tmp_path / "__pycache__").glob("kernels.unit*"):
         left.unlink()
     assert called() == ["5.0", "False", "False", "0.6", "0.0", "-0.8", "1"]
+
+
+SCALED = """
+import numpy as np
+
+from perch_core.jit import compiled
+
+SCALE, TABLE = {scale}, (np.array([1.0, {entry}]), 2.0)
+
+@compiled
+def scaled(x: float) -> float:
+    return SCALE * x
+
+@compiled
+def summed(x: float) -> float:
+    return scaled(x) + TABLE[0][1]
+"""
+
+
+def test_compiled_code_is_replaced_where_a_constant_of_a_kernel_that_it_calls_has_changed() -> None:
+    def constants(scale: float, entry: float) -> str:
+        module: dict = {}
+        exec(SCALED.format(scale=scale, entry=entry), module)
+        return module["summed"].constants
+
+    assert constants(9.81, 3.0) == constants(9.81, 3.0)
+    assert len({constants(9.81, 3.0), constants(3.7, 3.0), constants(9.81, 3.0 + 1e-15)}) == 3

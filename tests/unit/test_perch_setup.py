@@ -178,6 +178,23 @@ def test_only_what_the_build_reads_changes_a_package_stamp(repository):
     assert len(set(seen)) == len(seen)
 
 
+def test_a_constant_that_kernels_import_changes_their_stamp_and_other_files_do_not(repository, monkeypatch):
+    monkeypatch.setattr(stamps, "SOURCES", repository / "src")
+    package = repository / "src" / "perch_x" / "perch_x"
+    package.mkdir(parents=True)
+    (package / "kernels.py").write_text("from perch_x.vehicle import GRAVITY, Vehicle\nfrom perch_x.files import read\n@compiled\ndef fall(): ...\n")
+    (package / "vehicle.py").write_text("from perch_x.planet import (\n    G,\n    MASS)\nGRAVITY = G * MASS\n")
+    (package / "planet.py").write_text("G, MASS = 1.0, 9.81\n")
+    (package / "files.py").write_text("def read(): ...\n")
+    seen = [stamps.kernel_stamp("environment")]
+    (package / "files.py").write_text("def read(): return 1\n")
+    assert stamps.kernel_stamp("environment") == seen[0]
+    for name in ("planet.py", "vehicle.py", "kernels.py"):
+        (package / name).write_text((package / name).read_text() + "\n")
+        seen.append(stamps.kernel_stamp("environment"))
+    assert len(set(seen)) == len(seen)
+
+
 def test_stamps_survive_and_a_damaged_file_means_nothing_is_done(repository):
     stamps.save({"perch_x": "1"})
     assert stamps.load() == {"perch_x": "1"}

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from functools import cached_property, lru_cache, partial, update_wrapper
 from importlib.util import find_spec
 from pathlib import Path
+from types import CodeType, ModuleType
 from typing import Any, TypeVar, cast, overload
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
@@ -62,6 +63,18 @@ def _package(file: Path) -> Path:
     return folder
 
 
+def _names(code: CodeType) -> set[str]:
+    """Return the names that are read by a function and the functions within it."""
+    return set(code.co_names).union(*(_names(inner) for inner in code.co_consts if isinstance(inner, CodeType)))
+
+
+def _text(value: Any) -> str:
+    """Return all digits of a constant: a number, an array, or a tuple of constants."""
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_text, value))})"
+    return f"{value.dtype} {value.shape} {value.tobytes().hex()}" if hasattr(value, "tobytes") else repr(value)
+
+
 def _load(cache: Any, signature: Any, target: Any) -> Any:
     """Load a kernel's compiled code for a signature from its cache; None if it is not cached, in which case numba compiles it.
 
@@ -87,14 +100,26 @@ class _Compiled:
         update_wrapper(self, kernel)
 
     @cached_property
+    def constants(self) -> str:
+        """Hash of the global values that are compiled into this kernel and into the kernels that it calls."""
+        digest = hashlib.sha256()
+        for name in sorted(_names(self.py_func.__code__)):
+            value = self.py_func.__globals__.get(name)
+            if isinstance(value, _Compiled):
+                digest.update(b"" if value is self else value.constants.encode())
+            elif not callable(value) and not isinstance(value, ModuleType):
+                digest.update(f"{name} {_text(value)};".encode())
+        return digest.hexdigest()
+
+    @cached_property
     def dispatcher(self) -> Any:
         """numba's dispatcher of this kernel."""
         out = _njit()(cache=True, error_model="numpy", **self._options)(self.py_func)
-        # numba's cache looks at the kernel's own file alone: a change in a kernel that it calls in another file would go
-        # unseen. The hash of all sources with kernels takes the place of that file's date.
+        # numba's cache looks at the date of the kernel's own file alone: a change of a kernel that it calls in another file, or of a
+        # constant from another file, would go unseen. The hashes of all sources with kernels and of these constants take its place.
         cache: Any = getattr(out, "_cache", None)
         if hasattr(getattr(cache, "_cache_file", None), "_source_stamp"):
-            cache._cache_file._source_stamp = _stamp(_package(Path(self.py_func.__code__.co_filename)))
+            cache._cache_file._source_stamp = _stamp(_package(Path(self.py_func.__code__.co_filename))) + self.constants
         if hasattr(cache, "_load_overload"):
             cache.load_overload = partial(_load, cache)
         return out
