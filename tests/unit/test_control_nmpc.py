@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -29,7 +30,7 @@ from perch_core.compiled import compiler
 from perch_core.lines import Segment, scaled_clearance
 from perch_core.rotor_model import RotorModel
 from perch_core.trajectory import rest_to_rest
-from perch_core.vehicle import ControlGains, load_vehicle
+from perch_core.vehicle import GRAVITY, ControlGains, load_vehicle
 from perch_planner.powerline import problem
 from perch_sim.scenario import load_scenario
 from perch_sim.timing import CONTROL_PERIOD
@@ -58,9 +59,10 @@ def argument(layout, rng):
 
 @pytest.mark.parametrize("states", [13, 17])
 def test_dynamics_of_a_stage_are_the_rigid_bodys(states):
-    """Independent integration of oracles.rigid_body with drag, in small steps. [P:eq1]"""
+    """Independent integration of oracles.rigid_body with drag, in small steps. [tests M:eq1, P:eq1]"""
     layout, step, rng = StageLayout(states, False), 0.05, np.random.default_rng(1)
     z = argument(layout, rng)
+    z[10:13] = 4.0, -5.0, 3.0  # gyroscopic moments count
     z[states + 4 + 17:states + 4 + 23] = rng.normal(size=6) * 0.5
     following = np.array(stage(SNAPDRAGON, step, layout)(z)[0]).ravel()
     p, R, v, w = z[0:3], Rotation.from_quat(z[3:7]), z[7:10], z[10:13]
@@ -277,6 +279,19 @@ def test_l1_cuts_the_error_under_wind_and_mass(law):
             loop.controller.compensator = L1Augmentation(SNAPDRAGON)
         rmse[adaptive] = loop.move_rmse()
     assert rmse[True] < 0.4 * rmse[False], rmse
+
+
+@pytest.mark.parametrize("period", [0.002, 0.01])
+def test_l1_finds_no_disturbance_in_a_turn_of_the_exact_model(period):
+    """Thrust of the weight, pitching with 10 rad/s: v = g e1 (1 - cos wt) / w + g e3 (sin wt / w - t)."""
+    vehicle, w = replace(SNAPDRAGON, drag=(0.0, 0.0, 0.0)), 10.0
+    l1, speed, found = L1Augmentation(vehicle), (math.sqrt(vehicle.hover_thrust / 4.0 / vehicle.thrust_coefficient),) * 4, []
+    for k in range(round(0.3 / period)):
+        t = k * period
+        v = (GRAVITY * (1.0 - math.cos(w * t)) / w, 0.0, GRAVITY * (math.sin(w * t) / w - t))
+        l1.update((0.0, 0.0, 0.0, *v, 0.0, math.sin(0.5 * w * t), 0.0, math.cos(0.5 * w * t), 0.0, w, 0.0), speed, t)
+        found.append(max(map(abs, l1.disturbance[:3])))
+    assert max(found) < 0.01
 
 
 def test_l1_finds_the_disturbance_that_acts():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_perception.ukf.stillness import is_at_rest
-from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioPose
+from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioOutcome, VioPose
 
 CONFIG, RATE, SIGMA = UkfConfig(), 100.0, (0.03, 0.01)
 PERIOD = round(1e9 / RATE)
@@ -118,3 +118,37 @@ def test_rest_is_in_the_variance_whatever_the_biases(rate, turn):
         rows[:, 1:4] += rng.normal(0.0, 0.05, (len(rows), 3))
         assert not is_at_rest(rows)
     assert all(seen)
+
+
+@pytest.mark.parametrize("coasting", [0.6, 1.0, 2.5])
+def test_a_flight_without_vio_before_the_rest_is_not_left_out(coasting):
+    """At 1 m/s, then it brakes and rests. The IMU that is kept is shorter than the flight."""
+    rng, estimator, p, v, sigmas = np.random.default_rng(0), Estimator(CONFIG), 0.0, 0.0, []
+    for k in range(1, round(500 * (2.0 + coasting))):
+        t = 0.002 * k
+        a = 2.5 if 0.3 < t <= 0.7 else -5.0 if 1.0 + coasting < t <= 1.2 + coasting else 0.0
+        p, v = p + 0.002 * v + 0.5 * a * 0.002**2, v + 0.002 * a
+        shaken = 1.0 if 0.3 < t <= 1.2 + coasting else 0.335
+        estimator.add_imu(ImuSample(2_000_000 * k, tuple(rng.normal(0.0, 0.011, 3)), tuple(rng.normal([a, 0.0, 9.81], shaken))))
+        if t <= 1.0 and k > 100 and k % 16 == 0:
+            estimator.add_vio(VioPose(2_000_000 * k, np.array([p, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), 1e-5 * np.eye(6),
+                                      np.array([v, 0.0, 0.0]), 1e-4 * np.eye(3)))
+    found = estimator.estimate
+    assert abs(found.v_WB[0]) < 0.01 and abs(found.p_WB[0] - p) < 3.0 * np.sqrt(found.P[0, 0])
+
+
+def test_a_pose_that_the_imu_history_does_not_reach_is_too_old():
+    """After a pause of VIO the oldest anchor may be older than the IMU samples that are kept."""
+    rng, outcomes = np.random.default_rng(0), set()
+    for pause in range(1000, 1520, 60):
+        estimator = Estimator(CONFIG)
+        for k in range(1, (pause + 720) // 2):
+            now = 2_000_000 * k
+            estimator.add_imu(ImuSample(now, tuple(rng.normal(0.0, 0.01, 3)), tuple(rng.normal([0.0, 0.0, 9.81], 2.0))))
+            if now > 200_000_000 and k % 16 == 0 and now <= pause * 1_000_000:
+                estimator.add_vio(VioPose(now - 40_000_000, np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), 1e-5 * np.eye(6)))
+        stamp = (pause + 50) * 1_000_000
+        outcome = estimator.add_vio(VioPose(stamp, np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), 1e-5 * np.eye(6)))
+        assert (outcome is VioOutcome.TOO_OLD) or stamp >= estimator._imu.oldest
+        outcomes.add(outcome)
+    assert VioOutcome.TOO_OLD in outcomes

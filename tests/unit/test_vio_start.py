@@ -13,7 +13,8 @@ from perch_perception.vio import VioConfig
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import observe
 from perch_perception.vio.motion_start import MotionStart
-from perch_perception.vio.start import configured_pose
+from perch_perception.vio.preintegration import preintegrate
+from perch_perception.vio.start import add_heading_by_bias, at_rest, configured_pose, initial_state
 
 MOUNT = load_vehicle("snapdragon").mounts["down"]
 RATE, FRAMES, NOISE = 200.0, 20.0, 0.3
@@ -71,3 +72,32 @@ def test_a_start_in_motion_is_as_wrong_as_it_says():
 def test_a_start_in_motion_waits_where_nothing_tells_the_scale():
     """0.3 m/s with 0.2 m/s^2: half a second of that is less than the accelerometer's bias and noise."""
     assert begin("slow", 0, give_up=0.65) is None
+
+
+def test_a_heading_that_the_gyro_has_propagated_has_the_errors_of_its_bias_and_noise():
+    """The derivative by finite differences; the sigma after ten seconds of a bias that is known to 5 mrad/s."""
+    rng, h, seconds = np.random.default_rng(4), 1.0 / RATE, 10.0
+    w = np.array([0.3, -0.2, 0.1]) + rng.normal(0.0, 0.2, (round(seconds * RATE), 3))
+    rows = np.column_stack([np.full(len(w), h), w, np.tile([0.0, 0.0, 9.81, 1e-6, 0.1], (len(w), 1))])
+    R, known = so3.exp(np.array([0.1, 0.2, 0.3])), configured_pose(np.zeros(3), 0.0)
+    part = preintegrate(rows, np.zeros(3), np.zeros(3))
+    pose = known.turned(R @ part.dR, part.J[:3, :3], part.Q[:3, :3])
+    for axis in np.eye(3):
+        step = so3.log((R @ part.dR).T @ R @ preintegrate(rows, 1e-5 * axis, np.zeros(3)).dR) / 1e-5
+        assert (R @ part.dR @ step)[2] == pytest.approx(pose.heading_by_bias @ axis, abs=1e-3 * seconds)
+    assert pose.covariance[3, 3] - known.covariance[3, 3] == pytest.approx(1e-6 * h**2 * len(w), rel=0.01)
+    state = initial_state(CONFIG, MOUNT, 0, pose.R_WB, pose, np.zeros(3), np.zeros(3), 0.0, 0.1, 5e-3)
+    before = state.P.copy()
+    add_heading_by_bias(state, pose)
+    up_B, u = pose.R_WB[2], pose.heading_by_bias
+    assert up_B @ (state.P - before)[at.THETA, at.THETA] @ up_B == pytest.approx(25e-6 * u @ u) and u @ u > 20.0
+    np.testing.assert_allclose(state.P[at.THETA, at.GYRO_BIAS], 25e-6 * np.outer(up_B, u))
+
+
+def test_starts_take_over_the_heading_with_the_error_of_its_bias():
+    steps = np.tile([1.0 / RATE, 0.0, 0.0, 0.0, 0.0, 0.0, 9.81, 1e-6, 1e-2], (60, 1))
+    known = configured_pose(np.zeros(3), 0.0)
+    still, turned = (at_rest(CONFIG, MOUNT, 0, steps, pose) for pose in (known, known.turned(np.eye(3), -5.0 * np.eye(3), np.zeros((3, 3)))))
+    variance = still.P[at.GYRO_BIAS, at.GYRO_BIAS][2, 2]
+    assert (turned.P - still.P)[at.THETA, at.THETA][2, 2] == pytest.approx(25.0 * variance, rel=1e-6)
+    assert turned.P[at.THETA, at.GYRO_BIAS][2, 2] == pytest.approx(-5.0 * variance, rel=1e-6)

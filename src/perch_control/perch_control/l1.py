@@ -111,19 +111,13 @@ class L1Augmentation:
             now: time of the state [s].
         """
         measured = (*state[3:6], *state[10:13])
-        f = thrusts(speed, self._vehicle[1][0])
-        if self._last is None or not 0.0 < now - self._last[0] < _LONGEST_GAP:
-            predicted = measured
-        else:
-            time, state0, f0, predicted0, measured0, raw = self._last
+        rates, predicted, raw = model_rates(state, thrusts(speed, self._vehicle[1][0]), self._vehicle), measured, _ZERO
+        if self._last is not None and 0.0 < now - self._last[0] < _LONGEST_GAP:
+            time, rates0, predicted0, measured0, raw0 = self._last
             dt = now - time
-            mean = tuple(0.5 * (a + b) for a, b in zip(f0, f))
-            rates = model_rates(state0, mean, self._vehicle)
-            predicted = tuple(z + dt * (r + d - _DECAY * (z - m))
-                              for z, r, d, m in zip(predicted0, rates, raw, measured0))
+            predicted = tuple(z + dt * (0.5 * (r + r0) + d - _DECAY * (z - m))
+                              for z, r, r0, d, m in zip(predicted0, rates, rates0, raw0, measured0))
             raw, self.disturbance = adapted(predicted, measured, self.disturbance, _DECAY, dt,
                                             self.bandwidth, (_FORCE_MAX, _MOMENT_MAX))
-            self._last = (now, state, f, predicted, measured, raw)
-            return tuple(-x for x in self.disturbance)
-        self._last = (now, state, f, predicted, measured, _ZERO)
+        self._last = (now, rates, predicted, measured, raw)
         return tuple(-x for x in self.disturbance)

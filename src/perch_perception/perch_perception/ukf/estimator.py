@@ -152,7 +152,8 @@ class Estimator:
                 return VioOutcome.FUTURE
             self._waiting = sorted([*self._waiting, pose], key=lambda w: w.stamp)
             return VioOutcome.WAITING
-        if pose.stamp < (self._anchors[0].stamp if self._anchors else self._imu.oldest):
+        oldest = self._imu.oldest
+        if pose.stamp < min((a.stamp for a in self._anchors if a.stamp >= oldest), default=oldest):
             return VioOutcome.TOO_OLD
         return None
 
@@ -163,7 +164,7 @@ class Estimator:
         return VioOutcome.STARTED
 
     def _apply(self, pose: VioPose) -> VioOutcome:
-        anchor = next(a for a in reversed(self._anchors) if a.stamp <= pose.stamp)
+        anchor = self._anchor(pose.stamp)
         prior = self._transform.predict(anchor, self._imu.run(anchor.stamp, pose.stamp), pose.stamp)
         innovation, outcome = self._innovate(prior, pose), VioOutcome.APPLIED
         self._nis, self._nis_dimension = innovation.nis, len(innovation.residual)
@@ -175,6 +176,10 @@ class Estimator:
             innovation = self._innovate(prior, pose)
         self._set_base(self._transform.correct(prior, innovation) if pose.inertial is None else start.from_state(pose, pose.inertial))
         return outcome
+
+    def _anchor(self, stamp: int) -> Belief:
+        """Return the newest anchor that is not after a stamp [ns]: the history of the IMU reaches back to anchors only, not to the base."""
+        return next(a for a in reversed(self._anchors) if a.stamp <= stamp)
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
         R = pose.covariance + start.added_noise(self.config.vio)
@@ -213,7 +218,8 @@ class Estimator:
         try:
             if not self._resting:
                 begin = max(belief.stamp, 2 * middle - now)
-                stopped = after_stop(self._transform.predict(belief, self._imu.run(belief.stamp, begin), begin))
+                anchor = self._anchor(begin)
+                stopped = after_stop(self._transform.predict(anchor, self._imu.run(anchor.stamp, begin), begin))
                 if stopped is None:
                     return
                 belief = stopped

@@ -307,4 +307,5 @@ class MotionStart:
         state.P[9:, 9:] = 0.0
         state.P[np.ix_(rows, rows)] += to_W @ P @ to_W.T
         state.P[at.LENS, at.LENS] = lens  # considered, not estimated
+        start.add_heading_by_bias(state, pose)
         return state

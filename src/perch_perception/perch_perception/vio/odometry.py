@@ -102,8 +102,8 @@ class VisualInertialOdometry:
     def _begin_motion_start(self) -> None:
         """Begin to collect frames for a start in motion."""
         self._motion_start = motion_start.MotionStart(self.config, self.mount, None if self._biases is None else self._biases[0][:3])
-        # rotation since the pose was known, by the gyro less a bias, and its derivative by that
-        self._rotation, self._rotation_bias = (np.eye(3), np.zeros((3, 3))), self._motion_start.gyro_bias
+        # rotation since the pose was known, by the gyro less a bias, its derivative by that, and its covariance from noise
+        self._rotation, self._rotation_bias = (np.eye(3), np.zeros((3, 3)), np.zeros((3, 3))), self._motion_start.gyro_bias
 
     @property
     def gyro_sigma(self) -> float:
@@ -199,7 +199,8 @@ class VisualInertialOdometry:
             turn = preintegrate(steps, state.gyro_bias if state else self._motion_start.gyro_bias, np.zeros(3)).dR
             if state is None:
                 part = preintegrate(steps, self._rotation_bias, np.zeros(3))
-                self._rotation = self._rotation[0] @ part.dR, part.dR.T @ self._rotation[1] + part.J[:3, :3]
+                R, J, P = self._rotation
+                self._rotation = R @ part.dR, part.dR.T @ J + part.J[:3, :3], part.dR.T @ P @ part.dR + part.Q[:3, :3]
                 slack = 2e-9 * self._motion_start.gyro_sigma * (exposure - self._last_exposure)
         features = self.tracker.track(image, R_BC.T @ turn.T @ R_BC, slack)
         self._recent_views.add(exposure, features)
@@ -249,12 +250,12 @@ class VisualInertialOdometry:
             self._known_at = pose.stamp, float(np.linalg.norm(odometry.v_B))
             self._rotation_bias, self._at_configured_start = self._motion_start.gyro_bias, False
             part = preintegrate(self._imu.run(pose.stamp, exposure), self._rotation_bias, np.zeros(3))
-            self._rotation = part.dR, part.J[:3, :3]
+            self._rotation = part.dR, part.J[:3, :3], part.Q[:3, :3]
 
     def _known_pose_with_bias(self, gyro_bias: np.ndarray) -> KnownPose:
         """Return the known present pose, with the heading propagated by the gyro less this bias."""
-        dR, J = self._rotation
-        return replace(self._known_pose, R_WB=self._known_pose.R_WB @ dR @ so3.exp(J @ (gyro_bias - self._rotation_bias)))
+        dR, J, P = self._rotation
+        return self._known_pose.turned(self._known_pose.R_WB @ dR @ so3.exp(J @ (gyro_bias - self._rotation_bias)), J, P)
 
     def _begin(self, state: at.State) -> None:
         if self._known_at is not None:

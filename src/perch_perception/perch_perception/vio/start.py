@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from perch_core import so3
@@ -32,11 +32,25 @@ class KnownPose:
         p_WB: [m], shape (3,).
         R_WB: shape (3, 3).
         covariance: of (p, heading), shape (4, 4).
+        heading_by_bias: derivative of the heading by the gyro bias, where the gyro has propagated it [s], shape (3,).
     """
 
     p_WB: np.ndarray
     R_WB: np.ndarray
     covariance: np.ndarray
+    heading_by_bias: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def turned(self, R_WB: np.ndarray, by_bias: np.ndarray, covariance: np.ndarray) -> KnownPose:
+        """Return the pose after a rotation by the gyro.
+
+        Args:
+            R_WB: attitude after it, shape (3, 3).
+            by_bias: derivative of the rotation vector in B by the gyro bias [s], shape (3, 3).
+            covariance: of this vector from the gyro's noise, shape (3, 3).
+        """
+        P = self.covariance.copy()
+        P[3, 3] += R_WB[2] @ covariance @ R_WB[2]
+        return replace(self, R_WB=R_WB, covariance=P, heading_by_bias=self.heading_by_bias + R_WB[2] @ by_bias)
 
 
 def configured_pose(p_WB: np.ndarray, yaw: float) -> KnownPose:
@@ -98,7 +112,15 @@ def at_rest(config: VioConfig, mount: CameraMount, stamp: int, steps: np.ndarray
     H[:, at.THETA], H[:, at.ACCEL_BIAS] = so3.hat(up_B), np.eye(3)
     dx, state.P, _ = ekf.update(state.P, np.arange(at.INERTIAL_SIZE), H, accel - up_B, imu.accel_noise_density**2 * noise_factor / T)
     state.inject(dx)
+    add_heading_by_bias(state, pose)
     return state
+
+
+def add_heading_by_bias(state: State, pose: KnownPose) -> None:
+    """Add to a start's attitude, theta = R^T e3 (u b_g), the error of a heading that the gyro has propagated: u = `heading_by_bias`."""
+    F = np.eye(len(state.P))
+    F[at.THETA, at.GYRO_BIAS] = np.outer(state.R_WB[2], pose.heading_by_bias)
+    state.P = F @ state.P @ F.T
 
 
 def propagate_position(state: State, since: Preintegration) -> None:
