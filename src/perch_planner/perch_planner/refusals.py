@@ -56,9 +56,10 @@ def _precheck_quantities(points: Array, a: Array, j: Array, yaw: float, yaw_rate
         low_height, high_height, nearest: limits; the last is that of the distance of a waypoint from the surface's plane [m].
 
     Returns:
-        (specific thrust of the start [m/s^2], sine of the angle between it and b2_des, its body rate [rad/s], reach of the rim towards the surface at the start [m],
-        distance of the start from the surface's plane [m], first point whose height is out of range and that height [m], first
-        waypoint too near to the plane and its distance [m], least path length to the contact [m]); points are -1 for none.
+        (specific thrust of the start [m/s^2], sine of the angle between it and b2_des, its body rate [rad/s], reach of the rim
+        towards the surface at the start [m], distance of the start from the surface's plane [m], first point whose height is out
+        of range and that height [m], first waypoint too near to the plane and its distance [m], least path length to the contact
+        [m]); points are -1 for none.
     """
     x, y, z = a[0], a[1], a[2] + GRAVITY
     specific, rate = sqrt(x * x + y * y + z * z), sqrt(squared_rate(x, y, z, j[0], j[1], j[2], yaw, yaw_rate))
