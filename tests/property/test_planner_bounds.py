@@ -203,7 +203,7 @@ def test_a_small_limit_of_the_body_rate_is_proved_not_sampled(limit):
     thrust, _, _ = plan_checks.thrust_extrema(still, T, 1.0, 20.0)
 
     def holds(yaw):
-        return plan_checks.check(still, yaw, T, thrust, -5.0 * up, 0.0 * up, up, 1.0, 20.0, 5.0, -1.0, 1.0, 0.1, 0.0, limit)[2]
+        return plan_checks.check(still, yaw, T, thrust, -5.0 * up, 0.0 * up, up, 1.0, 20.0, 5.0, -1.0, 1.0, 0.1, 0.0, 0.0, limit)[2]
 
     assert not holds(np.concatenate([[0.0], np.cumsum(rate) / 14.0])[None])
     assert holds(np.zeros((1, 15)))
