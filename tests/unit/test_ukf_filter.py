@@ -150,6 +150,21 @@ def test_process_noise_is_the_spread_of_integrated_noise():
     np.testing.assert_allclose(spread, expected, rtol=0.1)
 
 
+def test_a_correction_carries_its_covariance_to_the_corrected_state():
+    """An error e of the state before is minus(plus(x, step + e), plus(x, step)) of the one after; its derivative by differences."""
+    rng = np.random.default_rng(7)
+    belief, gain, S = random_belief(rng), 0.3 * rng.normal(size=(15, 6)), 1e-3 * np.eye(6)
+    residual = rng.normal(size=6)
+    corrected = UnscentedTransform.correct(belief, unscented.Innovation(residual, S, gain, 0.0))
+    step = gain @ residual
+    assert 0.3 < np.linalg.norm(step[at.D_ATTITUDE]) < 2.0
+    np.testing.assert_allclose(at.minus(corrected.x, belief.x), step, atol=1e-12)
+    h, J = 1e-6, np.zeros((15, 15))
+    for i, e in enumerate(h * np.eye(15)):
+        J[:, i] = (at.minus(at.plus(belief.x, step + e), corrected.x) - at.minus(at.plus(belief.x, step - e), corrected.x)) / (2.0 * h)
+    np.testing.assert_allclose(corrected.P, J @ (belief.P - gain @ S @ gain.T) @ J.T, atol=1e-8)
+
+
 @pytest.mark.parametrize("size", [6, 9])
 def test_update_equals_filterpys_on_the_error_state(size):
     """filterpy's own UKF, whose state is the 15-dimensional error, gives the same gain, covariance and correction."""
