@@ -134,7 +134,7 @@ def scaled_line(p_WB: Vector, q_WB: Vector, o_W: Vector, l_W: Vector, radii: Vec
 
 
 def line_clearance(o: Vector, l: Vector) -> Scalar:
-    """Squared distance of a line from the unit ball times |l|^2; positive: no contact. [defines P:eq4, P:eq5]
+    """(d^2 - 1) |l|^2 with the line's distance d from the origin of the scaled space; positive: no contact. [defines P:eq4, P:eq5]
 
     The paper's expression `(|o|^2 - 1) |l|^2 - (o.l)^2 > 0`, from |o x l|^2 = |o|^2 |l|^2 - (o.l)^2.
     """
