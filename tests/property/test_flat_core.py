@@ -58,10 +58,10 @@ def random_trajectory(seed: int, segments: int = 3, degree: int = 9) -> FlatTraj
 @quick
 @given(seeds, st.floats(0.05, 0.95))
 def test_samples_carry_the_derivatives_of_the_flat_outputs(seed, fraction):
-    """[M:eq3, M:eq17]"""
-    trajectory = random_trajectory(seed, segments=1)
+    """[tests M:eq3, M:eq17]"""
+    trajectory = random_trajectory(seed)
     t = fraction * trajectory.duration
-    x = BPoly(trajectory.coefficients[0].T[:, None, :], [0.0, trajectory.duration])
+    x = BPoly(trajectory.coefficients.transpose(2, 0, 1), [0.0, *np.cumsum(trajectory.durations)])
     sample = trajectory.sample(t)
     for order, value in enumerate((sample.p, sample.v, sample.a, sample.j, sample.s)):
         expected = x.derivative(order)(t) if order else x(t)
@@ -92,7 +92,7 @@ def state_at(trajectory, t, mass=0.25):
 @quick
 @given(seeds, st.floats(0.1, 0.9))
 def test_rates_and_accelerations_are_derivatives_of_the_attitude(seed, fraction):
-    """[M:eq13]"""
+    """[tests M:eq13]"""
     trajectory = random_trajectory(seed, segments=1)
     t, h = fraction * trajectory.duration, 1e-4
     before, here, after = (state_at(trajectory, t + k * h) for k in (-1, 0, 1))
@@ -105,7 +105,7 @@ def test_rates_and_accelerations_are_derivatives_of_the_attitude(seed, fraction)
 @quick
 @given(seeds, st.floats(0.0, 1.0))
 def test_newton_holds_and_the_attitude_is_a_rotation_with_b2_towards_the_reference(seed, fraction):
-    """[M:eq9, M:eq10, M:eq12]"""
+    """The inverse of [M:eq9]. [tests M:eq10, M:eq12]"""
     trajectory = random_trajectory(seed)
     t = fraction * trajectory.duration
     sample, state = trajectory.sample(t), state_at(trajectory, t)

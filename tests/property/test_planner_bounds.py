@@ -30,7 +30,7 @@ def thrust_like(seed: int) -> np.ndarray:
 @given(seeds)
 @settings(max_examples=60)
 def test_maximum_is_enclosed_and_attained(seed):
-    """[M:alg1]"""
+    """[tests M:alg1]"""
     poly = thrust_like(seed)
     attained, proved, place = bounds.maximum(poly, 1e-9 * np.abs(poly).max(), -np.inf)
     dense = bernstein.evaluate(poly, np.linspace(0.0, 1.0, 2001))
@@ -54,10 +54,11 @@ def test_a_floor_saves_work_but_leaves_the_bound_proved(seed, share):
 @given(seeds)
 @settings(max_examples=30)
 def test_thrust_extrema_of_a_plan_are_close_and_those_of_its_segments_are_proved(seed):
+    """[tests M:eq9, M:eq16]"""
     rng = np.random.default_rng(seed)
     segments = np.cumsum(np.cumsum(rng.normal(0.0, 0.01, (4, 3, 15)), axis=2), axis=2)
     durations = rng.uniform(0.4, 1.0, 4)
-    extrema, least, most = plan_checks.thrust_extrema(segments, durations, 2.0, 16.0)
+    extrema, least, most = plan_checks.thrust_extrema(segments, durations, 9.0, 16.0)
     places = np.linspace(0.0, 1.0, 1001)
     norms = []
     for segment, duration in zip(segments, durations):
@@ -68,6 +69,8 @@ def test_thrust_extrema_of_a_plan_are_close_and_those_of_its_segments_are_proved
         assert row[1] <= norm.min() * (1.0 + 1e-9) and norm.max() <= row[4] * (1.0 + 1e-9)
         if norm.max() > 16.0:  # beyond the limit each segment's peak is known closely
             assert row[3] == pytest.approx(norm.max(), rel=2e-3)
+        if norm.min() < 9.0:
+            assert row[1]**2 == pytest.approx(norm.min()**2, abs=3e-3 * norm.max()**2)
     assert most == extrema[:, 4].max() and least == extrema[:, 1].min()
     assert most == pytest.approx(max(n.max() for n in norms), rel=2e-3)
 
@@ -91,7 +94,8 @@ def test_a_polynomial_on_its_bound_is_not_called_below():
 
 
 def test_the_papers_example_of_sturms_chain():
-    powers = np.array([-1.0, -1.0, 0.0, 1.0, 1.0])  # [M:eq19]
+    """[tests M:eq18, M:eq19]"""
+    powers = np.array([-1.0, -1.0, 0.0, 1.0, 1.0])
     chain, degrees = sturm.sturm_chain(powers)
     expected = [[-1, -1, 0, 1, 1], [-1, 0, 3, 4], [0.9375, 0.75, 0.1875], [-64, -32], [-0.1875]]
     for row, degree, wanted in zip(chain, degrees, expected):
@@ -103,7 +107,7 @@ def test_the_papers_example_of_sturms_chain():
 
 @given(st.lists(st.integers(1, 19), min_size=1, max_size=5, unique=True))
 def test_both_chains_count_the_roots_that_were_put_in(roots):
-    """[M:eq18]"""
+    """[tests M:eq18]"""
     powers = [Fraction(1)]
     for root in roots:
         powers = [a - Fraction(root, 20) * b for a, b in zip([Fraction(0), *powers], [*powers, Fraction(0)])]

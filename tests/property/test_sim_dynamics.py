@@ -41,6 +41,7 @@ def state(p=HIGH_UP, phi=(0, 0, 0), v=(0, 0, 0), w=(0, 0, 0)):
 @given(phi=VECTOR, v=VECTOR, w=VECTOR, wind=VECTOR, share=st.tuples(*[st.floats(0.0, 1.0)] * 4),
        name=st.sampled_from(["snapdragon", "rpg"]))
 def test_accelerations_are_those_of_newton_and_euler(phi, v, w, wind, share, name):
+    """The plant has rotor arms of its own. [tests P:eq2]"""
     vehicle = load_vehicle(name)
     speeds = vehicle.speed_max * np.array(share)
     x, out = state(phi=3 * phi, v=5 * v, w=10 * w), np.zeros(13)

@@ -41,7 +41,7 @@ def body(R, w):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_on_the_reference_the_law_is_flatness(seed):
-    """[M:eq2] without errors is feed-forward: thrust, attitude, rates and moment of [M:eq9-13] and [M:eq1]."""
+    """Without errors [M:eq2] is feed-forward: thrust, attitude, rates and moment of [M:eq9-13] and [M:eq1]."""
     x = flat(np.random.default_rng(seed))
     expected = flat_to_state(*x, mass=VEHICLE.mass)
     R, w, dw = expected.R_WB, expected.w_WB_B, expected.dw_WB_B
@@ -53,6 +53,42 @@ def test_on_the_reference_the_law_is_flatness(seed):
     np.testing.assert_allclose(dw_C[:2], dw[:2], rtol=1e-6, atol=1e-6 * (1 + np.abs(dw).max()))
     moment = np.array(J) * np.array(dw_C) + np.cross(w, np.array(J) * w)
     np.testing.assert_allclose(M, moment, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_off_the_reference_thrust_and_commanded_attitude_are_the_printed_ones(seed):
+    """f = -k_x e_x - k_v e_v + g e3 + a and what compensates for a disturbance; the thrust is f . R e3, R_C = [b2 x b3, b2, b3]. [tests M:eq2,10,12]"""
+    rng = np.random.default_rng(seed)
+    x, e_x, e_v, d, R = flat(rng), rng.normal(size=3), rng.normal(size=3), rng.normal(size=3), Rotation.random(random_state=seed)
+    state = tuple(float(v) for v in (*(x[0] + e_x), *(x[1] + e_v), *R.as_quat(), *rng.normal(size=3)))
+    thrust, _, q_C, _, _ = geometric_step(state, setpoint(x).packed, (*d, 0.0, 0.0, 0.0), GAINS, FREE, J)
+    f = -np.multiply(GAINS[0:3], e_x) - np.multiply(GAINS[3:6], e_v) + (0.0, 0.0, 9.81) + x[2] + d
+    b3 = f / np.linalg.norm(f)
+    b1 = np.cross((-np.sin(x[5]), np.cos(x[5]), 0.0), b3)
+    b1 /= np.linalg.norm(b1)
+    assert thrust == pytest.approx(f @ R.as_matrix()[:, 2])
+    np.testing.assert_allclose(Rotation.from_quat(q_C).as_matrix(), np.column_stack([b1, np.cross(b3, b1), b3]), atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_off_the_reference_the_moment_is_the_printed_one(seed):
+    """At small errors M = -k_R e_R - k_Omega e_Omega + Omega x J Omega - J (Omega x R^T R_C Omega_C - R^T R_C dOmega_C). [tests M:eq2]
+
+    The gains are per moment of inertia; to it comes what compensates for a disturbance.
+    """
+    rng = np.random.default_rng(seed)
+    x, d = flat(rng), rng.normal(size=3)
+    expected = flat_to_state(*x, mass=VEHICLE.mass)
+    R_C = expected.R_WB
+    R = R_C @ Rotation.from_rotvec(1e-3 * rng.normal(size=3)).as_matrix()
+    w = expected.w_WB_B + 0.3 * rng.normal(size=3)
+    state = tuple(float(v) for v in (*x[0], *x[1], *body(R, w)))
+    _, M, _, _, _ = geometric_step(state, setpoint(x).packed, (0.0, 0.0, 0.0, *d), GAINS, FREE, J)
+    E = 0.5 * (R_C.T @ R - R.T @ R_C)
+    e_R, w_C, dw_C = np.array([E[2, 1], E[0, 2], E[1, 0]]), R.T @ R_C @ expected.w_WB_B, R.T @ R_C @ expected.dw_WB_B
+    demand = -np.multiply(GAINS[6:9], e_R) - np.multiply(GAINS[9:12], w - w_C) - np.cross(w, w_C) + dw_C + d
+    # e_R, and the reference's angular acceleration about b3, agree to second order
+    np.testing.assert_allclose(np.array(M) / J, demand + np.cross(w, np.multiply(J, w)) / J, atol=2e-3 + 2e-6 * np.abs(demand).max())
 
 
 @pytest.mark.parametrize("angle", [10, 60, 120, 179, 180])

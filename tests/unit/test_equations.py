@@ -55,6 +55,15 @@ def test_a_definition_is_found_through_what_calls_it(tmp_path):
     assert (place.file, place.name) == ("src/perch_a/perch_a/law.py", "gain") and f"[`perch_a/law.py: gain`](../{place.file})" in page(root)
 
 
+def test_a_row_names_the_tests_of_its_equation_not_those_that_mention_it(tmp_path):
+    root = tree(tmp_path, LAW)
+    (root / "tests").mkdir()
+    (root / "tests" / "test_law.py").write_text('"""[tests M:eq2-3]"""\n')
+    (root / "tests" / "test_flight.py").write_text('"""[M:eq2] flies. [uses M:eq3]"""\n')
+    rows = [line for line in page(root).splitlines() if line.startswith(("| M (2)", "| M (3)"))]
+    assert len(rows) == 2 and all("test_law.py" in row and "test_flight.py" not in row for row in rows)
+
+
 @pytest.mark.parametrize("flown", ["from perch_a import law\nNODE = law.law()\n", "import perch_a.law as l\nNODE = l.law\n",
                                    'NODE = "perch_a.law:law"\n'])
 def test_modules_and_registries_are_followed(tmp_path, flown):

@@ -1,4 +1,4 @@
-"""Line geometry, costs and constraints against brute force, a pinhole camera and CasADi. [P:eq3-13]"""
+"""Line geometry, costs and constraints against brute force, a pinhole camera and CasADi. [tests P:eq3-13]"""
 
 from __future__ import annotations
 

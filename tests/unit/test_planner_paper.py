@@ -61,7 +61,7 @@ def test_only_violating_segments_and_their_neighbours_grow_until_none_is_left():
 
 
 def test_window_and_tube_are_those_of_what_flies():
-    """[M:eq14, M:eq15]"""
+    """[tests M:eq14, M:eq15]"""
     asked, durations = CASES[2], np.array([0.5, 0.6, 0.7])
     contact = Contact(asked, SETTINGS, VEHICLE.perch_offset)
     *_, (_, segments, places, orders, direction, lower, upper) = conditions(durations, False, contact.velocity, contact.problem)

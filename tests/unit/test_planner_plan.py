@@ -93,7 +93,7 @@ def test_a_negative_rotor_margin_lets_a_plan_ask_for_more_and_its_certificate_sa
     (90.0, {"impact_acceleration": 7.0}, 0.8), (135.0, {}, 0.8), (180.0, {}, 0.8), (0.0, {"impact_acceleration": 4.0, "impact_acceleration_fixed": True}, 0.65),
     (90.0, {"impact_speed_min": 0.7, "impact_speed_max": 0.7}, 0.7)])
 def test_the_impact_window_holds_at_the_planned_contact_where_none_holds_for_a_late_one_too(inclination, settings, speed):
-    """[M:eq14] The plan is at the edge that is nearest to what the late contact asks for, and the certificate says so."""
+    """The plan is at the edge that is nearest to what the late contact asks for, and the certificate says so. [tests M:eq14]"""
     target = surface(inclination)
     planned = checked(PerchProblem(HOVER, target), PerchSettings(**settings))
     impact = {c.quantity: c for c in planned.certificates}["impact_speed"]

@@ -30,7 +30,7 @@ THREE = ((0.5, 0.0, 1.4), (1.0, 0.2, 1.5), (1.5, 0.2, 1.5))
 
 
 def cost(coefficients: np.ndarray, durations: np.ndarray, order: int) -> float:
-    """Integral of the squared derivative by Gauss quadrature. [M:eq4]"""
+    """Integral of the squared derivative by Gauss quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(16)
     total = 0.0
     for segment, duration in zip(coefficients, durations):
@@ -41,7 +41,7 @@ def cost(coefficients: np.ndarray, durations: np.ndarray, order: int) -> float:
 
 @pytest.mark.parametrize("order", [3, 4])
 def test_gram_matrices_are_the_integrals(order):
-    """[M:eq5]"""
+    """[tests M:eq5]"""
     nodes, weights = np.polynomial.legendre.leggauss(16)
     rows = bernstein.evaluate(reference_element.TABLES[order, :15 - order].T, 0.5 * (nodes + 1.0))
     assert reference_element.GRAMS[order] == pytest.approx((rows * weights / 2) @ rows.T, rel=1e-9, abs=1e-8)
@@ -73,7 +73,7 @@ def solved(made, rows, solver: str = "daqp") -> np.ndarray:
 @pytest.mark.parametrize("objective, order", [("snap", 4), ("jerk", 3)])
 @pytest.mark.parametrize("waypoints, durations", [((), (1.6,)), (THREE, (0.7, 0.5, 0.5, 0.7))])
 def test_reduced_and_full_form_agree(objective, order, waypoints, durations):
-    """The program that flies has the optimum of the paper's. [M:eq4-8]"""
+    """The program that flies has the optimum of the paper's. [tests M:eq4-8, M:eq11, M:eq14]"""
     asked, durations = problem(60.0, waypoints), np.array(durations)
     settings = PerchSettings(objective=objective, tangential_speed_max=20.0, contact_delay=0.0)  # of which the paper knows nothing
     contact = Contact(asked, settings, VEHICLE.perch_offset)
@@ -137,7 +137,7 @@ def test_contradictory_bounds_are_not_called_solved(name):
 
 
 def test_end_conditions_and_continuity_are_exact():
-    """[M:eq6, M:eq7, M:eq11, M:eq14]"""
+    """[tests M:eq6, M:eq7]"""
     durations = np.array([0.7, 0.5, 0.5, 0.7])
     made, rows, given, values = program(Contact(problem(90.0, THREE), PerchSettings(), VEHICLE.perch_offset), durations)
     coefficients = solved(made, rows)
@@ -186,10 +186,11 @@ def test_cuts_hold_where_they_are_set_also_as_sums_of_derivatives():
 
 
 def test_tube_bounds_are_sorted_and_leave_room_on_every_axis():
+    """[tests M:eq15]"""
     surface = PerchSurface.from_inclination(np.zeros(3), np.pi / 2)
     end = 3.3 * surface.normal - (0.0, 0.0, 9.81)
     lower, upper = tube_bounds(end, 0.1, 0.33)
-    # At 90 degrees the paper's inequality [M:eq15] reads -8.829 <= z <= -10.791, which nothing satisfies, and y = 0.
+    # At 90 degrees the paper's inequality reads -8.829 <= z <= -10.791, which nothing satisfies, and y = 0.
     assert (lower[2], upper[2]) == pytest.approx((-10.791, -8.829))
     assert (lower[1], upper[1]) == pytest.approx((-0.33, 0.33), abs=1e-9)
     assert (lower < end).all() and (end < upper).all()

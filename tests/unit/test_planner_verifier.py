@@ -36,6 +36,7 @@ def findings(coefficients=None, durations=None, **changes):
 
 
 def test_the_untouched_plan_is_accepted():
+    """[tests M:eq14, M:eq15]"""
     assert findings() == ""
 
 
@@ -52,7 +53,6 @@ def test_the_untouched_plan_is_accepted():
     ({"rotors": dataclasses.replace(NEED.rotors, thrust=(0.4, 1.1))}, "rotor thrust, least"),
     ({"rotors": dataclasses.replace(NEED.rotors, thrust=(0.1, 0.7))}, "rotor thrust, greatest")])
 def test_a_broken_requirement_is_found(changes, words):
-    """[M:eq15]"""
     assert words in findings(**changes)
 
 
@@ -62,7 +62,7 @@ def test_the_heading_at_contact_counts_modulo_a_full_turn():
 
 @pytest.mark.parametrize("length, instants", [(0.12, 12), (0.105, 11), (0.004, 1)])
 def test_the_tube_is_checked_at_all_its_instants(length, instants):
-    """[M:eq15] A tube of no width is left at every instant but the contact."""
+    """A tube of no width is left at every instant but the contact."""
     tube = (length, 0.01, 0.0, 0.0)
     assert findings(tube=tube).count("tube") == instants
 

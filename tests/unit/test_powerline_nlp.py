@@ -1,4 +1,4 @@
-"""Stage functions and the problem's derivatives against CasADi's own, the cache, and the interpreted path. [P:eq14-15]"""
+"""Stage functions and the problem's derivatives against CasADi's own, the cache, and the interpreted path."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import pytest
 
 from perch_core import lines, so3
 from perch_core.lines import Segment
-from perch_core.rotor_model import RotorModel
+from perch_core.rotor_model import RotorModel, hover_state
 from perch_core.vehicle import load_vehicle
-from perch_planner.powerline import compiled, nlp
+from perch_planner.powerline import compiled, nlp, solving
+from perch_planner.powerline.formulation import Weights
 from perch_planner.powerline.stage_functions import StageModel, line_parameters, stage_functions
 
 VEHICLE = load_vehicle("rpg")
@@ -82,12 +83,46 @@ def test_gauss_newton_has_the_gradient_and_never_bends_down() -> None:
     assert min(least) < -0.1  # the exact one does
 
 
-def test_running_cost_is_equation_15() -> None:
-    x, u, N = state([0, 0, 1], w=[1.0, 2, 3]), np.array([0.1, -0.2, 0.3, 0.4]), 30
+@pytest.mark.parametrize("N", [30, 45])
+def test_running_cost_is_equation_15(N: int) -> None:
+    """With N times the paper's impulse, and weights that mean the same for each N as for the authors' 30. [tests P:eq15]"""
+    x, u = state([0, 0, 1], w=[1.0, 2, 3]), np.array([0.1, -0.2, 0.3, 0.4])
     T, rates = 2.0, 40.0 * u
     impulse = np.full(4, 1.9) * T / N + rates * T**2 / (2 * N**2)
-    cost = float(STAGES.functions["run"](x, u, 1 / N, [0.02, 0.3, 40.0 / (2 * N), 0.0]))
-    assert cost == pytest.approx(0.02 * N**2 * impulse @ impulse + 0.3 * 14)
+    weights = solving.run_weights(Weights(thrust=0.02, rate=0.3, rate_between=0.0), 0.0, 40.0, N)
+    cost = float(STAGES.functions["run"](x, u, 1 / N, weights))
+    assert cost == pytest.approx(30 / N * (0.02 * N**2 * impulse @ impulse + 0.3 * 14))
+
+
+def test_end_cost_weighs_each_error_against_its_own_reference() -> None:
+    """Position, direction of b3, velocity and body rate of equation 15, and the thrust of a hover. [tests P:eq15]"""
+    rng = np.random.default_rng(5)
+    x, reference = rng.normal(size=18), rng.normal(size=12)
+    x[3:7] = so3.quat_exp(rng.normal(size=3))
+    b3, hover = so3.quat_to_matrix(x[3:7])[:, 2], VEHICLE.mass * 9.81 / 4
+    squares = [np.sum(error**2) for error in (x[:2] - reference[:2], x[2] - reference[2], b3 - reference[3:6], x[7:10] - reference[6:9],
+                                              x[10:13] - reference[9:12], x[13:17] - hover)]
+    weights = solving.end_weights(Weights(xy_end=2.0, z_end=3.0, tilt_end=5.0, v_end=7.0, w_end=11.0, thrust_end=13.0))
+    assert float(STAGES.functions["end"](x, reference, weights)) == pytest.approx(np.dot([2.0, 3.0, 5.0, 7.0, 11.0, 13.0], squares))
+
+
+@pytest.mark.parametrize("duration, reached", [((2.5, 4.0), 2.5), ((0.1, 0.6), 0.6)])
+def test_a_solution_goes_to_the_bounds_of_duration_height_and_thrust_and_no_farther(duration: tuple[float, float], reached: float) -> None:
+    """Its goal, 2 m away and below the least height, takes 1.6 s. [tests P:eq14]"""
+    N, hover = 10, VEHICLE.mass * 9.81 / 4
+    start, goal = hover_state(STAGE.rotor, np.array([0.0, 0, 1.2]), np.array([0.0, 0, 0, 1])), np.array([2.0, 0, 0.5])
+    data = nlp.ProblemData(
+        start=start, reference=np.array([*goal, 0, 0, 1, *np.zeros(6)]), lines=np.zeros((0, 8)), run_weights=np.array([0.02, 0.3, 0.0, 0.0]),
+        end_weights=np.array([3000.0, 3000, 10, 1, 1, 0]), perception_weights=np.zeros((N, 3)), duration=duration, height_min=1.0,
+        thrust=(0.7 * hover, 1.2 * hover), body_rate=10.0, end_tolerance=np.zeros(0), clearance=np.zeros(N),
+        states=np.tile([*start, sum(duration) / 2], (N + 1, 1)), inputs=np.zeros((N, 4)), defects=np.zeros((N, 18)))
+    found = nlp.Problem(nlp.Structure(N, 0, False, solver="ipopt"), STAGES).solve(data)
+    assert found.converged and found.duration == pytest.approx(reached, abs=1e-5)
+    assert found.states[1:, 2].min() == pytest.approx(1.0, abs=1e-5)
+    thrust = found.states[1:, 13:17]
+    assert 0.7 * hover - 1e-5 <= thrust.min() and thrust.max() <= 1.2 * hover + 1e-5
+    if reached == 0.6:  # in a hurry
+        assert (thrust.min(), thrust.max()) == pytest.approx((0.7 * hover, 1.2 * hover), abs=1e-3)
 
 
 def test_spin_between_the_nodes_sees_a_peak_that_both_nodes_miss() -> None:

@@ -48,6 +48,7 @@ def planned(planner: PowerlinePlanner) -> PlannedProblem:
     ("with 30 intervals the end is missed by millimetres", 0, 172.47, 0.18, (0.89, 0.47, 2.29), 0.7, (0.35, 0.46, -0.06), True)])
 def test_a_plan_is_found_where(planner: PowerlinePlanner, why: str, target: int, pitch_deg: float, along: float,
                                position: tuple, yaw: float, velocity: tuple, perception: bool) -> None:
+    """And it keeps all its bounds when it is integrated again. [tests P:eq14]"""
     start = REQUEST.start.copy()
     start[P], start[Q], start[V] = position, so3.quat_exp(np.array([0.0, 0.0, yaw])), velocity
     line = SETUP.segments()[target]

@@ -1,4 +1,4 @@
-"""The 17-state model against the rigid-body module, a fine integration and conservation laws. [P:eq1-2]"""
+"""The 17-state model against the rigid-body module, a fine integration and conservation laws. [tests M:eq1, P:eq1]"""
 
 from __future__ import annotations
 

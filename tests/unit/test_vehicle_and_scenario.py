@@ -21,6 +21,7 @@ def test_snapdragon_has_the_papers_thrust_range():
 
 
 def test_allocation_is_the_sum_of_forces_and_their_lever_arms():
+    """[tests P:eq2]"""
     vehicle = load_vehicle("snapdragon")
     rng = np.random.default_rng(1)
     thrust = rng.uniform(0.1, 1.0, 4)
