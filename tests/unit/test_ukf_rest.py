@@ -123,7 +123,7 @@ def test_rest_is_in_the_variance_whatever_the_biases(rate, turn):
 @pytest.mark.parametrize("coasting", [0.6, 1.0, 2.5])
 def test_a_flight_without_vio_before_the_rest_is_not_left_out(coasting):
     """At 1 m/s, then it brakes and rests. The IMU that is kept is shorter than the flight."""
-    rng, estimator, p, v, sigmas = np.random.default_rng(0), Estimator(CONFIG), 0.0, 0.0, []
+    rng, estimator, p, v = np.random.default_rng(0), Estimator(CONFIG), 0.0, 0.0
     for k in range(1, round(500 * (2.0 + coasting))):
         t = 0.002 * k
         a = 2.5 if 0.3 < t <= 0.7 else -5.0 if 1.0 + coasting < t <= 1.2 + coasting else 0.0

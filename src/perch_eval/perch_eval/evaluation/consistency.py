@@ -48,7 +48,8 @@ def consistency_sections(effort: Effort) -> list[Section]:
     out = Section("c_consistency", "Consistency of the estimators",
                   f"`{SCENARIO}` with cameras rendered and calibration errors drawn, seeds {seeds.start} to {seeds.stop - 1}; a motion "
                   "that differs between runs only by its sway in the hover, VIO's start parameters wrong as declared (1 mm, 1 mrad). NEES per "
-                  "dimension, averaged over the flight; the share of the time in which the mean over the runs is inside its 95 % bounds, and above them (overconfident).")
+                  "dimension, averaged over the flight; the "
+                  "share of the time in which the mean over the runs is inside its 95 % bounds, and above them (overconfident).")
     motion = flights.motion_of(load_scenario(SCENARIO), seeds.start)  # its phases are those of every run
     found = dict(with_progress(in_processes(_fly, list(seeds), effort.jobs), len(seeds), unit="perches"))
     flown = [found[seed] for seed in seeds]

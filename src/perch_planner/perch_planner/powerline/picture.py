@@ -79,6 +79,7 @@ def draw_manoeuvre(planned: PlannedProblem, path: Path, bodies: int = 12) -> Non
         axes.plot(*view(part.states[:, P]).T, color=colour, lw=1, label=f"{name}, {part.duration:.2f} s")
         for k in np.linspace(0, len(part.times) - 1, bodies).astype(int):
             _body(axes, view, planned, part.states[k], colour)
+    axes.plot([], [], color=CAMERA_AXIS, lw=1, label="camera axis")
     axes.set_title(planned.problem.description or planned.problem.name, fontsize=10)
     axes.legend(loc="lower left", fontsize=8)
     figure.savefig(path, dpi=130)
