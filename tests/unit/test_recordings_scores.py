@@ -76,7 +76,7 @@ def bench(monkeypatch):
 
 
 def test_a_page_without_recordings_says_so(bench):
-    page = "\n".join(bench.page({}, "a command"))
+    page = "\n".join(bench.page({}, "a command", {"commit": "", "digest": ""}))
     assert page.count(bench.MISSING) == 18 and all(recording.title in page for recording in bench.RECORDINGS.values())
 
 
@@ -87,5 +87,5 @@ def test_racing_motion_holds_where_every_seed_does(bench, errors, verdict):
 
 def test_the_page_is_that_of_its_figures(bench):
     folder = ROOT / "docs" / "results" / "recordings"
-    page = "\n".join(bench.page(json.loads((folder / "results.json").read_text())["recordings"], "a command"))
+    page = "\n".join(bench.page(json.loads((folder / "results.json").read_text())["recordings"], "a command", {"commit": "", "digest": ""}))
     assert page.partition(bench.INTRODUCTION)[2] == (folder / "README.md").read_text().rstrip("\n").partition(bench.INTRODUCTION)[2]
