@@ -495,6 +495,24 @@ def test_without_commands_motors_are_off_after_four_seconds_and_stay_so(body):
         assert not body.loop.aimed.any()  # only a command to disarm lets the next one arm
 
 
+def test_a_controller_that_is_started_again_in_flight_does_not_stop_the_motors(body):
+    """Its commands have the motors off: the descent ends first, and then it arms again."""
+    last, body.loop.cut = body.loop.last_command, True
+    while body.time < last + 1.0:
+        body.step(True)
+    body.loop.cut = False
+    while body.time < last + 3.95:
+        body.step(False)
+        assert body.loop.aimed.min() > 0.8 * np.sqrt(VEHICLE.hover_thrust / 4.0 / VEHICLE.thrust_coefficient)
+    assert body.loop.watchdog.mode is Mode.DESCENDING and body.tilt < 3.0
+    while body.time < last + 4.2:
+        body.step(False)
+    assert not body.loop.aimed.any()
+    for _ in range(300):
+        body.step(True)
+    assert body.loop.watchdog.mode is Mode.FOLLOWING and body.loop.aimed.all()
+
+
 @pytest.mark.parametrize("tilt", [0.0, 60.0])
 def test_the_pilot_has_the_vehicle_within_50_ms_of_his_switch(body, tilt):
     body.found((0, 1, 0), tilt, 4.0 if tilt else 0.0)
