@@ -81,31 +81,33 @@ def test_an_image_that_is_drawn_later_is_handed_to_neighbours_once_it_is_drawn(e
     assert seen == [image]
 
 
-def test_each_of_two_open_requests_gets_its_own_answer(executor):
-    asking, replies, results = participant(executor, Asking), created(executor, ArrivalNode, Serving).component.replies, []
-    for _ in range(2):
-        asking.component.plan_perch(REQUEST, 0)
-    until(executor, lambda: len(replies) == 2)
-    for reply, message in zip(replies, ("first", "second")):
+def answered(executor, asking, replies, *messages):
+    """The answers of the next batch, once as many requests have come as there are messages, which answer them in order."""
+    results = []
+    until(executor, lambda: len(replies) == len(messages))
+    for reply, message in zip(replies, messages):
         reply(PerchPlan(success=False, error_code=2, message=message))
     asking.participant.begin(1, [])
     until(executor, lambda: results.append(asking.participant.results()) or results[-1] is not None)
-    assert asking.component.answers == ["first", "second"]
+    return asking.component.answers
+
+
+def test_each_of_two_open_requests_gets_its_own_answer(executor):
+    asking, replies = participant(executor, Asking), created(executor, ArrivalNode, Serving).component.replies
+    for _ in range(2):
+        asking.component.plan_perch(REQUEST, 0)
+    assert answered(executor, asking, replies, "first", "second") == ["first", "second"]
 
 
 def test_an_answer_that_comes_after_its_request_was_dropped_is_not_that_of_the_next_one(executor, monkeypatch):
-    asking, replies, results = participant(executor, Asking), created(executor, ArrivalNode, Serving).component.replies, []
+    asking, replies = participant(executor, Asking), created(executor, ArrivalNode, Serving).component.replies
     asking.component.plan_perch(REQUEST, 0)
     until(executor, lambda: len(replies) == 1)
     monkeypatch.setattr("perch_sim.ros.participant_node.ANSWER_TIMEOUT", -1.0)
     asking._expire_requests()
     asking.component.plan_perch(REQUEST, 0)
-    until(executor, lambda: len(replies) == 2)
-    for reply, message in zip(replies, ("late", "second")):
-        reply(PerchPlan(success=False, error_code=2, message=message))
-    asking.participant.begin(1, [])
-    until(executor, lambda: results.append(asking.participant.results()) or results[-1] is not None)
-    assert len(asking.component.answers) == 2 and "has not answered" in asking.component.answers[0] and asking.component.answers[1] == "second"
+    first, second = answered(executor, asking, replies, "late", "second")
+    assert "has not answered" in first and second == "second"
 
 
 class Failing(Component[Nothing]):
