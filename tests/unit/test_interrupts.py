@@ -93,8 +93,11 @@ with quiet_on_interrupt():
 
 def interrupted_once(process: subprocess.Popen, file: str, words: str) -> str:
     """What a process says after SIGINT at the moment when words are in a file of its /proc."""
-    place = Path(f"/proc/{process.pid}/{file}")
+    place, end = Path(f"/proc/{process.pid}/{file}"), time.monotonic() + 60.0
     while words not in place.read_text() and process.poll() is None:
+        if time.monotonic() > end:
+            process.kill()
+            pytest.fail(f"{words!r} not in {place} for 60 s")
         time.sleep(0.001)
     process.send_signal(signal.SIGINT)
     said = process.communicate(timeout=60.0)[1]
