@@ -33,6 +33,7 @@ TILTED = ((30.0, 2.0), (60.0, 4.0), (90.0, 0.0), (85.0, 6.5))
 """Tilt [deg] and rate [rad/s] of a body in free air at the last commands, which demand that rate."""
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.8, 0.0))
 """Axes of its rotation: roll, pitch, and between them."""
+PERCH_TIME_MAX = 60.0                     # of the undisturbed flight [s]
 OBSERVATION_TIME = 6.0                    # after they have stopped [s]
 
 
@@ -74,7 +75,7 @@ def phase_times() -> dict[str, float]:
     """Return the times of `PHASES` in the undisturbed flight [s]."""
     loop, _, touched = start_flight()
     with closing(loop):
-        while not any(phase == "perched" for _, phase, _ in loop.trace.phases):
+        while loop.time < PERCH_TIME_MAX and not any(phase == "perched" for _, phase, _ in loop.trace.phases):
             loop.step()
     at = {phase: time for time, phase, _ in reversed(loop.trace.phases)}
     at["contact"] = min(time for time in touched if time > at["tracking"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -11,6 +12,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
+from perch_core.processes import end_with_parent, without_interrupts
 from perch_core.ros.priority import PRIORITY
 from perch_sim.timing import CONTROL_PERIOD_NS
 
@@ -27,7 +29,7 @@ def cores_awake() -> Iterator[None]:
     machines, idle=poll or the governor prevents this. The work has pauses: if all cores are busy throughout, a host with a quota
     per 100 ms withdraws them for the rest of the period, for up to 10 ms (docs/real_time.md).
     """
-    processes = [_start(_spin, os.getpid()) for _ in range(os.cpu_count() or 1)]
+    processes = [_start(_spin) for _ in range(os.cpu_count() or 1)]
     try:
         yield
     finally:
@@ -86,9 +88,17 @@ class StolenTime:
 
 
 def _start(work, *arguments) -> BaseProcess:
-    process = _spawn.Process(target=work, args=arguments, daemon=True)
-    process.start()
+    process = _spawn.Process(target=_work_until_parent_ends, args=(os.getpid(), work, *arguments), daemon=True)
+    with without_interrupts():
+        process.start()
     return process
+
+
+def _work_until_parent_ends(parent: int, work, *arguments) -> None:
+    """Call `work` in a process that ends with its parent, also with one that is killed or ends at once on Ctrl-C."""
+    end_with_parent(signal.SIGKILL)
+    if os.getppid() == parent:
+        work(*arguments)
 
 
 def _schedule(policy: str, priority: int) -> None:
@@ -101,9 +111,9 @@ def _sleep_until(due: int) -> None:
     time.sleep(max(0, due - time.monotonic_ns()) * 1e-9)
 
 
-def _spin(parent: int) -> None:
+def _spin() -> None:
     _schedule("SCHED_IDLE", 0)
-    while os.getppid() == parent:  # one that was killed cannot end this process
+    while True:
         rest = time.monotonic() + SPIN_TIME
         while time.monotonic() < rest:
             pass

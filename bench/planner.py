@@ -10,11 +10,8 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import numpy as np
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
 import exact_sturm
+import numpy as np
 from harness import Figure, figure
 from random_perches import paper_like_problem, shipped_settings
 

@@ -92,7 +92,7 @@ def main() -> int:
     if arguments.out:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
         write_json(arguments.out, result)
-    return 1 if broken or unconfirmed or exceptions else 0
+    return 1 if broken or unconfirmed or exceptions or not done else 0
 
 
 if __name__ == "__main__":

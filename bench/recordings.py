@@ -258,6 +258,8 @@ def main() -> int:
                         help=f"score one of {', '.join(RECORDINGS)}; the others keep their figures of the same code")
     parser.add_argument("--out", type=Path, default=root() / "docs/results/recordings", metavar="DIR", help="of the page")
     arguments = parser.parse_args()
+    if not arguments.folder.is_dir():
+        parser.error(f"{arguments.folder} is no folder")  # the page would lose every recording
     arguments.out.mkdir(parents=True, exist_ok=True)
     single_threaded_blas()
     data = arguments.out / "results.json"

@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from harness import Figure, figure
 from machine import LateWakeUps, StolenTime, cores_awake, late_with_load
 from nav_msgs.msg import Odometry
+from perch_core.errors import PerchError
 from perch_core.ros.topics import stamp_of, topic
 from perch_core.trajectory import rest_to_rest
 from perch_core.values import ControllerCommand as Command
@@ -116,6 +117,8 @@ def running(scenario: Scenario, folder: Path, **options) -> Iterator[tuple[Probe
                 break
             probe.spin_for(0.1)
             stack.raise_if_ended()
+        else:
+            raise PerchError(f"simulation time is {probe.time:g} s after 60 s: the nodes do not step")
         yield probe, stack
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from perch_setup import ROOT, command_parser, enter, leave_quietly_on_interrupt
+from perch_setup.enter import INTERRUPTED
 
 GROUPS = ("planner", "perception", "control", "powerline", "sim", "autopilot", "ros")
 EXAMPLES = """examples:
@@ -16,7 +17,7 @@ EXAMPLES = """examples:
   python3 scripts/bench.py planner --json out.json  and the figures as JSON
   python3 scripts/bench.py planner --quick          fewer repetitions, for a first look
 
-exit code: 0 every required value is met, 1 one is not or a group could not be measured, 2 wrong arguments"""
+exit code: 0 every required value is met, 1 one is not or a group could not be measured, 2 wrong arguments, 130 Ctrl-C"""
 
 
 def main() -> int:
@@ -48,6 +49,8 @@ def main() -> int:
         print(f"== {group}", flush=True)
         try:
             results[group] = importlib.import_module(group).figures(arguments.quick)  # bench/<group>.py
+        except KeyboardInterrupt:  # in a node's wait
+            return INTERRUPTED
         except Exception as error:  # a group that breaks must not hide the figures of the others
             print(f"error: {group}: {type(error).__name__}: {error}", file=sys.stderr)
             failed = True

@@ -23,8 +23,8 @@ def command_line() -> argparse.ArgumentParser:
     commands.add("list", "parameters:list_parameters", "names, of one node or of all").add_argument("node", nargs="?")
     get = commands.add("get", "parameters:get_parameter", "one value")
     change = commands.add("set", "parameters:set_parameter", "change one value")
-    describe = commands.add("describe", "parameters:describe_parameters", "unit, range and meaning, of one parameter or of all")
-    for command, how_many in ((get, None), (change, None), (describe, "?")):
+    describe = commands.add("describe", "parameters:describe_parameters", "unit, range and meaning, of some parameters or of all")
+    for command, how_many in ((get, None), (change, None), (describe, "*")):
         command.add_argument("node")
         command.add_argument("parameter", nargs=how_many)
     change.add_argument("value", help="in YAML")

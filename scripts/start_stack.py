@@ -80,7 +80,7 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1 if isinstance(error, StackError) and not error.refused_input else 2
     except KeyboardInterrupt:
-        print("stopped", flush=True)
+        say("stopped")
         return 0
     return 1
 
@@ -118,7 +118,7 @@ def run(arguments: argparse.Namespace) -> None:
     with Stack(programs, folder, on_line=printer([program.name for program in programs])) as stack:
         with connect() as graph:
             stack.wait_until_ready(graph.visible_nodes, arguments.ready_timeout)
-        print(f"ready in ROS domain {os.environ['ROS_DOMAIN_ID']}: {', '.join(nodes)}. Logs: {folder}. Ctrl-C stops all.", flush=True)
+        say(f"ready in ROS domain {os.environ['ROS_DOMAIN_ID']}: {', '.join(nodes)}. Logs: {folder}. Ctrl-C stops all.")
         stack.wait()
         stack.raise_if_ended()
 
@@ -136,9 +136,19 @@ def printer(names: list[str]):
 
     def show(name: str, line: str) -> None:
         prefix = f"[{name:>{width}}]"
-        print(f"\033[{colours[name]}m{prefix}\033[0m {line}" if terminal else f"{prefix} {line}", flush=True)
+        say(f"\033[{colours[name]}m{prefix}\033[0m {line}" if terminal else f"{prefix} {line}")
 
     return show
+
+
+def say(line: str) -> None:
+    """Print a line; nothing once the reader of the output has ended (`... | tee` ends by Ctrl-C, too), as nodes go on until they have stopped."""
+    from perch_core.processes import discard_closed_output
+
+    try:
+        print(line, flush=True)
+    except BrokenPipeError:
+        discard_closed_output()
 
 
 if __name__ == "__main__":

@@ -14,7 +14,8 @@ import sys
 import tempfile
 from typing import IO, NoReturn
 
-from perch_setup import EXTRAS, ROOT, command_parser, enter
+from perch_setup import EXTRAS, ROOT, command_parser, enter, leave_quietly_on_interrupt, quiet_on_interrupt
+from perch_setup.enter import INTERRUPTED
 
 PARTS = (
     ("tests/system/test_flight_surface.py",), ("tests/system/test_restart.py",), ("tests/nodes/",), ("tests/unit/test_autopilot_firmware.py",),
@@ -36,7 +37,7 @@ EXAMPLES = """examples:
 
 
 def main() -> int:
-    """Run pytest; 0 all passed, 1 some failed, 2 wrong arguments."""
+    """Run pytest; 0 all passed, 1 some failed, 2 wrong arguments, 130 Ctrl-C."""
     parser = command_parser(__doc__, EXAMPLES, allow_abbrev=False)
     parser.add_argument("--quick", action="store_true", help="only the unit tests that fly, draw and start nothing")
     parser.add_argument("--fast", action="store_true", help="skip tests/system")
@@ -49,13 +50,15 @@ def main() -> int:
 
 def run_tests(quick: bool, fast: bool, for_pytest: list[str]) -> int:
     """Run pytest with a reserved ROS domain, in this process or in several that share all tests or the quick ones."""
-    from perch_eval.domain import free_domain
+    with quiet_on_interrupt():
+        import pytest  # noqa: F401
+        from perch_eval.domain import free_domain
 
     os.environ["ROS_DOMAIN_ID"] = str(free_domain())
     # Before the first message class is imported: rclpy does not check fields by default.
     os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
     os.chdir(ROOT)
-    chosen = ["tests/unit", "-m", "quick"] if quick else ["--ignore=tests/system"] if fast else []
+    chosen = ["-m", "quick", *["tests/unit"] * (not for_pytest)] if quick else ["--ignore=tests/system"] if fast else []
     processes = PROCESSES - 1 if quick else PROCESSES  # quick tests wait for nothing
     if not fast and not for_pytest and PROCESSES > 2:
         print(f"{processes} processes share the tests; what the others print comes at the end", flush=True)
@@ -68,8 +71,19 @@ def run_pytest(arguments: list[str], *plugins: object) -> int:
     """Run pytest in this process; return the exit code as in `main`."""
     import pytest
 
-    code = pytest.main(arguments, plugins)
-    return {0: 0, 1: 1}.get(int(code), 2 if code == pytest.ExitCode.USAGE_ERROR else 1)
+    interrupts = InterruptPlugin()
+    code = pytest.main(arguments, [*plugins, interrupts])
+    return INTERRUPTED if interrupts.seen else {0: 0, 1: 1}.get(int(code), 2 if code == pytest.ExitCode.USAGE_ERROR else 1)
+
+
+class InterruptPlugin:
+    """Pytest plugin that notes Ctrl-C; pytest's own exit code is the same where files could not be collected."""
+
+    seen = False
+
+    def pytest_keyboard_interrupt(self, excinfo) -> None:
+        """Pytest's own interrupts are of a derived class."""
+        self.seen = excinfo.type is KeyboardInterrupt
 
 
 class ForkServerPlugin:
@@ -124,6 +138,7 @@ class WorkerPlugin:
 
         The C library's exit is avoided, as threads of Fast DDS that tests have left crash in it.
         """
+        leave_quietly_on_interrupt()
         for pid, output in self._others:
             with output:
                 ended = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 from .environment import variables
-from .errors import SetupError
+from .errors import FAILED, SetupError
 from .layout import VENV, VENV_PYTHON
 from .prepare import prepare
 
@@ -55,6 +55,9 @@ def setting_up() -> Iterator[None]:
     except SetupError as error:
         print(f"perch: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
+    except OSError as error:  # a full disk, files of another user
+        print(f"perch: set-up failed: {error}", file=sys.stderr)
+        sys.exit(FAILED)
     except KeyboardInterrupt:
         print("\nperch set-up: interrupted; the next start goes on from here", file=sys.stderr)
         sys.exit(INTERRUPTED)

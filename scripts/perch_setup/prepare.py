@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Collection, Iterator
@@ -13,7 +12,7 @@ from pathlib import Path
 from . import stamps, virtualenv, workspace
 from .environment import variables
 from .errors import USAGE_ERROR, SetupError
-from .layout import BUILD, EXTRAS, INSTALL, ROOT, SOURCES, VENV, VENV_PYTHON
+from .layout import EXTRAS, INSTALL, ROOT, SOURCES, VENV_PYTHON
 from .lock import descriptors, setup_lock
 from .machine import Platform, check_python, check_tools, detect_platform, record_installation
 from .progress import Step
@@ -42,24 +41,21 @@ def prepare(clean: bool = False, extras: Collection[str] = ()) -> Platform:
         done = {} if clean else stamps.load()
         if _nothing_to_do(target, done, extras):
             return target
-        if clean:
-            for folder in (VENV, BUILD, INSTALL):
-                shutil.rmtree(folder, ignore_errors=True)
-        _install(target, done)
+        _install(target, done, clean)
         _install_extras(target, done, extras)
         with _compiled(target, done):
             _build(target, done)
     return target
 
 
-def _install(target: Platform, done: dict[str, str]) -> None:
-    """Install the locked packages, unless they are up to date."""
+def _install(target: Platform, done: dict[str, str], clean: bool = False) -> None:
+    """Install the locked packages, unless they are up to date; `clean`: in an empty environment."""
     environment = stamps.environment_stamp(target)
     if done.get("environment") == environment and virtualenv.usable():
         return
     identity = f"{target.ros} in {ROOT}"
     earlier = done.get("identity", identity)
-    fresh = earlier != identity or not virtualenv.usable()
+    fresh = clean or earlier != identity or not virtualenv.usable()
     if fresh:
         check_python(target)
     if earlier != identity:
@@ -94,7 +90,7 @@ def _install_extras(target: Platform, done: dict[str, str], extras: Collection[s
 def _build(target: Platform, done: dict[str, str]) -> None:
     """Build the packages that changed, or all of them in a new environment."""
     environment = done["environment"]
-    fresh = done.get("built_with", environment) != environment
+    fresh = done.get("built_with") != environment
     current = {folder: stamps.package_stamp(folder, environment) for folder in stamps.packages(target)}
     stale = [folder for folder in current if not _is_built(folder, current[folder], done)]
     if stale:
@@ -124,12 +120,14 @@ def _compiled(target: Platform, done: dict[str, str]) -> Iterator[None]:
                           stderr=subprocess.DEVNULL, pass_fds=descriptors()) as flight:
         try:
             yield
-            with Step("compiling the numerics of a flight") as step:
-                flight.wait()
-                try:
+            try:
+                with Step("compiling the numerics of a flight") as step:
+                    code = flight.wait()
                     step.run((*command, "nodes"), "warm_up", variables(target))
-                except SetupError as error:
-                    print(f"perch set-up: left to the first flight ({error})", file=sys.stderr)
+                if code:
+                    raise SetupError(f"{WARM_UP} flight: exit code {code}")
+            except SetupError as error:
+                print(f"perch set-up: left to the first flight ({error})", file=sys.stderr)
         finally:
             flight.kill()
     done["warmed"] = stamp

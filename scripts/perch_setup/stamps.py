@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Iterable
 
 from .layout import EXTRAS, ROOT, SOURCES, STATE
-from .machine import Platform
+from .machine import Platform, provides
 
 _FILE = STATE / "stamps.json"
 _IMPORT = re.compile(r"^from (perch_[\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
@@ -46,7 +46,7 @@ def package_stamp(package: Path, environment: str) -> str:
 
 def kernel_stamp(environment: str) -> str:
     """Return a stamp that changes with every file that holds compiled kernels, or constants that are imported for them."""
-    files = {file for file in SOURCES.rglob("*.py") if b"@compiled" in file.read_bytes()}
+    files = {file for file in SOURCES.rglob("*.py") if file.is_file() and b"@compiled" in file.read_bytes()}  # an editor's lock is no file
     pending = list(files)
     while pending:
         for module, names in _IMPORT.findall(pending.pop().read_text()):
@@ -58,14 +58,12 @@ def kernel_stamp(environment: str) -> str:
 
 
 def packages(target: Platform) -> list[Path]:
-    """Return the folders of all packages to build; those of ROS itself only if the sourced installation lacks them.
+    """Return the folders of all packages to build; those of ROS itself only if the installation lacks them.
 
     With our wheels, sourced packages are ignored, as they may be those of another checkout of perch.
     """
-    sourced = "" if target.uses_wheels else os.environ.get("AMENT_PREFIX_PATH", "")
-    prefixes = [Path(prefix) for prefix in sourced.split(os.pathsep) if prefix and not prefix.startswith(str(ROOT))]
     return sorted(file.parent for file in SOURCES.glob("*/package.xml")
-                  if file.parent.name.startswith("perch_") or not any((prefix / "share" / file.parent.name).is_dir() for prefix in prefixes))
+                  if target.uses_wheels or file.parent.name.startswith("perch_") or not provides(file.parent.name))
 
 
 def load() -> dict[str, str]:

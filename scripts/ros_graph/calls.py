@@ -34,7 +34,7 @@ def call_service(graph: GraphConnection, arguments: argparse.Namespace) -> int:
 
 
 def send_goal(graph: GraphConnection, arguments: argparse.Namespace) -> int:
-    """Run `action.py send_goal`: return 0 if the goal succeeds, otherwise 1. Ctrl-C cancels the goal."""
+    """Run `action.py send_goal`: return 0 if the goal succeeds, otherwise 1. Ctrl-C cancels the goal, and is raised again."""
     cls = interface(arguments.type, "action")
     goal = fill(cls.Goal(), parse(arguments.values, "goal"))
     action = graph.absolute(arguments.action)
@@ -52,30 +52,32 @@ def send_goal(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     except KeyboardInterrupt:  # the goal may have been accepted all the same
         handle = graph.answer(sent, action)
         if handle.accepted:
-            print("cancelling the goal", file=sys.stderr)
-            graph.answer(handle.cancel_goal_async(), "cancel")
+            _cancel(graph, handle)
         raise
     if not handle.accepted:
         print("goal rejected")
         return 1
     print("goal accepted", flush=True)
-    outcome = _result(graph, handle)
-    client.destroy()
-    status = _STATUS.get(outcome.status, f"UNKNOWN ({outcome.status})")
-    sys.stdout.write(f"result:\n{_indented(to_yaml(outcome.result))}goal finished: {status}\n")
-    return 0 if outcome.status == GoalStatus.STATUS_SUCCEEDED else 1
-
-
-def _result(graph: GraphConnection, handle: ClientGoalHandle):
-    """Wait for the goal's result, without time-out; after Ctrl-C, for that of the cancelled goal."""
     result = handle.get_result_async()
     try:
         graph.spin_until(result.done)
     except KeyboardInterrupt:
-        print("cancelling the goal", file=sys.stderr)
-        graph.answer(handle.cancel_goal_async(), "cancel")
-        return graph.answer(result, "cancelled goal", timeout=30.0)
-    return result.result()
+        _cancel(graph, handle)
+        _print_outcome(graph.answer(result, "cancelled goal", timeout=30.0))
+        raise
+    return 0 if _print_outcome(result.result()) == GoalStatus.STATUS_SUCCEEDED else 1
+
+
+def _cancel(graph: GraphConnection, handle: ClientGoalHandle) -> None:
+    print("cancelling the goal", file=sys.stderr)
+    graph.answer(handle.cancel_goal_async(), "cancel")
+
+
+def _print_outcome(outcome) -> int:
+    """Print a goal's result and status; return the status."""
+    status = _STATUS.get(outcome.status, f"UNKNOWN ({outcome.status})")
+    print(f"result:\n{_indented(to_yaml(outcome.result))}goal finished: {status}", flush=True)
+    return outcome.status
 
 
 def _indented(text: str) -> str:

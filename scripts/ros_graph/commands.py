@@ -6,14 +6,17 @@ import argparse
 import importlib
 import sys
 
-from perch_setup import command_parser, enter
-
-USAGE_ERROR = 2
-INTERRUPTED = 130
+from perch_setup import command_parser, enter, quiet_on_interrupt
+from perch_setup.enter import INTERRUPTED
+from perch_setup.errors import FAILED, USAGE_ERROR
 
 
 class GraphError(Exception):
     """Raised when the graph does not fit the request. The message is one line."""
+
+
+class NoAnswerError(GraphError):
+    """Raised when a part of the graph does not answer in time."""
 
 
 class Commands:
@@ -68,24 +71,25 @@ def carry_out(command_line: argparse.ArgumentParser) -> int:
     """Parse, set up if necessary, and run the sub-command; errors become one line, Ctrl-C and a closed pipe end it quietly.
 
     Returns:
-        The exit code: that of the sub-command, or 2 for invalid input.
+        The exit code: that of the sub-command, 1 without an answer, or 2 for invalid input.
     """
     arguments = command_line.parse_args()
     enter()
-    from perch_core.errors import PerchError  # as rclpy, inside the environment only
-    from perch_core.processes import discard_closed_output
-
-    module, function = arguments.handler.split(":")
-    try:
+    with quiet_on_interrupt():
+        from perch_core.errors import PerchError  # as rclpy, inside the environment only
+        from perch_core.processes import discard_closed_output
         from ros_graph.connection import connect
 
+        module, function = arguments.handler.split(":")
+        handler = getattr(importlib.import_module(f"ros_graph.{module}"), function)
+    try:
         with connect() as graph:
-            code = getattr(importlib.import_module(f"ros_graph.{module}"), function)(graph, arguments)
+            code = handler(graph, arguments)
         sys.stdout.flush()
         return code
     except (GraphError, PerchError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return USAGE_ERROR
+        return FAILED if isinstance(error, NoAnswerError) else USAGE_ERROR
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:  # `topic.py echo ... | head`

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import signal
 import time
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from perch_eval.ros.graph_node import GraphNode
-from ros_graph.commands import GraphError
+from ros_graph.commands import GraphError, NoAnswerError
 
 T = TypeVar("T")
 _SETTLED_S = 0.7
@@ -31,10 +32,10 @@ class GraphConnection(GraphNode):
         """Wait for the result of a future.
 
         Raises:
-            GraphError: no answer in time.
+            NoAnswerError: no answer in time.
         """
         if not self.spin_until(future.done, timeout):
-            raise GraphError(f"{what}: no answer within {timeout:g} s")
+            raise NoAnswerError(f"{what}: no answer within {timeout:g} s")
         return future.result()
 
     def settle(self, observe: Callable[[], T], timeout: float) -> T:
@@ -53,8 +54,15 @@ class GraphConnection(GraphNode):
         return observed
 
     def absolute(self, name: str) -> str:
-        """Return a name as an absolute one."""
-        return name if name.startswith("/") else f"/{name}"
+        """Return a name as an absolute one.
+
+        Raises:
+            GraphError: it is none of ROS.
+        """
+        absolute = name if name.startswith("/") else f"/{name}"
+        if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", absolute):
+            raise GraphError(f"name {name!r}: expected words of letters, digits and '_' with '/' between them, as in /quad1/odometry")
+        return absolute
 
 
 def connect() -> AbstractContextManager[GraphConnection]:

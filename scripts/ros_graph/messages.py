@@ -18,7 +18,7 @@ from ros_graph.commands import GraphError
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 LONGEST = 128  # elements of an array, and letters of a string, that are shown
-_SEQUENCES = (list, tuple, bytes, bytearray, array.array, np.ndarray)
+_SEQUENCES = (list, tuple, array.array, np.ndarray)
 
 
 def interface(name: str, kind: str) -> type:
@@ -39,7 +39,7 @@ def interface(name: str, kind: str) -> type:
     package, _, last = parts
     try:
         return getattr(importlib.import_module(f"{package}.{kind}"), last)
-    except (ImportError, AttributeError):
+    except (ImportError, AttributeError, TypeError):
         raise GraphError(f"type {name!r} is not known here: is its package built and sourced?") from None
 
 
@@ -50,10 +50,10 @@ def parse(text: str, what: str) -> dict[str, Any]:
         ConfigError: the text is not YAML.
         GraphError: the text is not a mapping.
     """
-    values = parse_yaml(text, what) if text else {}
-    if not isinstance(values or {}, dict):
+    values = parse_yaml(text or "{}", what)
+    if not isinstance(values, dict):
         raise GraphError(f"{what}: expected fields as in '{{name: value}}', got {text!r}")
-    return values or {}
+    return values
 
 
 def fill(message: Any, values: dict[str, Any], path: str = "") -> Any:
@@ -138,6 +138,8 @@ def _plain(value: Any, arrays: bool, type_name: str = "") -> Any:
         if not arrays:
             return f"<array type: {type_name or 'array'}, length: {len(value)}>"
         return [_plain(item, arrays) for item in value[:LONGEST]] + ["..."] * (len(value) > LONGEST)
+    if isinstance(value, bytes):  # an octet
+        return value[0]
     if isinstance(value, str):
         return value if len(value) <= LONGEST else f"{value[:LONGEST]}..."
     return value.item() if isinstance(value, np.generic) else value

@@ -23,7 +23,8 @@ def list_parameters(graph: GraphConnection, arguments: argparse.Namespace) -> in
     nodes = [graph.absolute(arguments.node)] if arguments.node else _nodes(graph, arguments.spin_time)
     for node in nodes:
         names = _names(graph, _client(graph, node, arguments.spin_time), node)
-        print(f"{node}:")
+        if not arguments.node:
+            print(f"{node}:")
         print("".join(f"  {name}\n" for name in names), end="")
     return 0
 
@@ -42,7 +43,7 @@ def get_parameter(graph: GraphConnection, arguments: argparse.Namespace) -> int:
 def describe_parameters(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `param.py describe`: print meaning, type, unit and allowed values of parameters."""
     node, client = _node(graph, arguments)
-    names = [arguments.parameter] if arguments.parameter else _names(graph, client, node)
+    names = arguments.parameter or _names(graph, client, node)
     values = _values(graph, client, node, names)
     found = graph.answer(client.describe_parameters(names), node).descriptors
     for name, value, descriptor in zip(names, values, found):
@@ -108,13 +109,18 @@ def _node(graph: GraphConnection, arguments: argparse.Namespace) -> tuple[str, A
 
 
 def _nodes(graph: GraphConnection, timeout: float) -> list[str]:
-    return sorted(name for name in graph.settle(graph.nodes, timeout) if not hidden(name))
+    """Return the nodes that have parameters and are not hidden."""
+    def found() -> set[str]:
+        services = {name for name, _ in graph.node.get_service_names_and_types()}
+        return {node for node in graph.nodes() if f"{node}/list_parameters" in services}
+
+    return sorted(name for name in graph.settle(found, timeout) if not hidden(name))
 
 
 def _client(graph: GraphConnection, node: str, timeout: float) -> AsyncParameterClient:
     client = AsyncParameterClient(graph.node, node)
     if not graph.spin_until(client.services_are_ready, timeout):
-        raise GraphError(f"node {node} does not exist or has no parameters; nodes: {', '.join(_nodes(graph, 1.0))}")
+        raise GraphError(f"node {node} does not exist or has no parameters; nodes that have: {', '.join(_nodes(graph, 1.0))}")
     return client
 
 

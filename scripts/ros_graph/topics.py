@@ -11,9 +11,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from ros_graph.commands import GraphError
+from ros_graph.commands import GraphError, NoAnswerError
 from ros_graph.connection import GraphConnection
 from ros_graph.messages import fill, interface, parse, pick, to_yaml
 
@@ -97,15 +98,18 @@ def publish(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `topic.py pub`."""
     message = fill(interface(arguments.type, "msg")(), parse(arguments.values, "message"))
     topic = graph.absolute(arguments.topic)
-    publisher = graph.node.create_publisher(type(message), topic, 10)
+    publisher = graph.node.create_publisher(type(message), topic, QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
     if arguments.once and not graph.spin_until(lambda: publisher.get_subscription_count() > 0, arguments.spin_time):
         raise GraphError(f"topic {topic} has no subscribers")
     publisher.publish(message)
+    due = time.monotonic()
     while not arguments.once:
-        due = time.monotonic() + 1.0 / arguments.rate
-        graph.spin_until(lambda: time.monotonic() >= due)  # noqa: B023 (called in this turn)
+        due = max(due + 1.0 / arguments.rate, time.monotonic())
+        graph.spin_for(due - time.monotonic())
+        graph.check()  # does not spin at a rate that is too high
         publisher.publish(message)
-    publisher.wait_for_all_acked()
+    if not publisher.wait_for_all_acked(Duration(seconds=10)):
+        raise NoAnswerError(f"topic {topic}: a subscriber has not acknowledged the message within 10 s")
     print(f"published one message on {topic}")
     return 0
 

@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool
 
 
 class Peer(Node):
-    """Says what it hears, knows one gain, can be armed, and flies forever when asked for `takeoff_height` 2."""
+    """Says what it hears, as subscriber of latched messages, knows one gain, can be armed, and flies forever when asked for `takeoff_height` 2."""
 
     def __init__(self) -> None:
         super().__init__("peer")
@@ -28,7 +28,7 @@ class Peer(Node):
         self._points = self.create_publisher(PointStamped, "points", qos_profile_sensor_data)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._heard = self.create_publisher(String, "heard", latched)
-        self.create_subscription(String, "say", lambda m: self._heard.publish(String(data=f"heard {m.data}")), 10)
+        self.create_subscription(String, "say", lambda m: self._heard.publish(String(data=f"heard {m.data}")), latched)
         self.create_service(SetBool, "arm", self._arm)
         self._action = ActionServer(self, Perch, "perch", self._fly, cancel_callback=lambda _: CancelResponse.ACCEPT)
         self._count = 0
@@ -72,9 +72,10 @@ def main() -> None:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node, executor = Peer(), EventsExecutor()
     executor.add_node(node)
+    bare = Node("bare", start_parameter_services=False)
     print(f"up {time.time_ns()}", flush=True)
     spin_until_stopped(executor, stop)
-    node.destroy_node()
+    node.destroy_node(), bare.destroy_node()
     rclpy.shutdown()
 
 

@@ -90,6 +90,8 @@ def test_published_messages_arrive_and_latched_ones_are_echoed(run):
 def test_parameters(run):
     assert run("param.py", "get", "/peer", "gain").stdout == "2.0\n"
     assert "  gain\n" in run("param.py", "list", "peer").stdout
+    eventually(lambda: run("param.py", "list").stdout.startswith("/peer:\n  gain\n"))  # of all nodes, but /bare has none
+    assert run("param.py", "describe", "peer", "gain", "use_sim_time").stdout.startswith("gain: 2.0\n")
     accepted = run("param.py", "set", "/peer", "gain", "3")  # an integer for a double
     assert (accepted.returncode, accepted.stdout) == (0, "/peer: gain is now 3.0\n")
     refused = run("param.py", "set", "/peer", "gain", "-1")
@@ -128,7 +130,7 @@ def test_interrupting_send_goal_cancels_the_goal(peer):
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=PATIENCE)
     assert "message: cancelled" in out and "CANCELED" in out and "Traceback" not in error
-    assert process.returncode == 1
+    assert process.returncode == 130
 
 
 def test_interrupting_echo_is_quiet(peer):

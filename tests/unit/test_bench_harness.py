@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -74,6 +75,15 @@ def test_a_vehicle_that_never_levels_fails_the_bar(monkeypatch, gap, touch, miss
         assert judged["level within 10 deg"] is judged["descent or motors off"] is False
 
 
+def test_a_flight_that_never_perches_is_an_error_and_not_endless(monkeypatch):
+    autopilot = importlib.import_module("autopilot")
+    loop = SimpleNamespace(time=0.0, close=lambda: None, trace=SimpleNamespace(phases=[(1.0, "tracking", "")]))
+    loop.step = lambda: setattr(loop, "time", loop.time + 0.1)
+    monkeypatch.setattr(autopilot, "start_flight", lambda: (loop, None, [2.0]))
+    with pytest.raises(KeyError):
+        autopilot.phase_times()
+
+
 def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):
     stat, clock = tmp_path / "stat", iter((10.0, 20.0))
     monkeypatch.setattr(machine, "time", SimpleNamespace(monotonic=lambda: next(clock)))  # of this module alone: others read it, too
@@ -84,14 +94,28 @@ def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):
     assert stolen.share() == pytest.approx(1.0)  # 0.2 s of 10 s of two cores
 
 
-def test_spinning_processes_end_with_a_bench_that_was_killed():
-    code = """
-import machine, multiprocessing, time
+SPINNING = """
+import machine, multiprocessing, os, signal, time
+signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # as in scripts/bench.py
 with machine.cores_awake():
-    print(*[p.pid for p in multiprocessing.active_children()], flush=True)
+    pids = [p.pid for p in multiprocessing.active_children()]
+    while any(os.sched_getscheduler(pid) != os.SCHED_IDLE for pid in pids):  # they are being started
+        time.sleep(0.01)
+    print(*pids, flush=True)
     time.sleep(60)
 """
-    bench = subprocess.Popen([sys.executable, "-c", code], cwd=Path(machine.__file__).parent, stdout=subprocess.PIPE, text=True)
+
+
+def test_ctrl_c_ends_spinning_processes_without_a_traceback():
+    bench = subprocess.Popen([sys.executable, "-c", SPINNING], cwd=Path(machine.__file__).parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                             text=True, start_new_session=True)
+    bench.stdout.readline()
+    os.killpg(bench.pid, signal.SIGINT)  # as a terminal does
+    assert bench.communicate(timeout=30.0)[1] == "" and bench.returncode == 130  # all have closed it
+
+
+def test_spinning_processes_end_with_a_bench_that_was_killed():
+    bench = subprocess.Popen([sys.executable, "-c", SPINNING], cwd=Path(machine.__file__).parent, stdout=subprocess.PIPE, text=True)
     pids = [int(pid) for pid in bench.stdout.readline().split()]
     bench.kill()
     bench.wait()

@@ -43,6 +43,24 @@ def test_ctrl_c_that_nobody_looked_for_counts_at_the_end_of_the_connection(conne
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.parametrize("rate", [1000.0, 1e9])
+def test_ctrl_c_ends_publishing_also_at_a_rate_that_is_too_high_and_waits_are_periods(monkeypatch, connect, rate):
+    topics, published, waits = importlib.import_module("ros_graph.topics"), [], []
+    arguments = SimpleNamespace(type="std_msgs/msg/Empty", values="", topic="/x", once=False, rate=rate)
+
+    def publish(message):
+        published.append(message)
+        assert len(published) < 100
+        if len(published) == 10:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt), connect() as graph:
+        monkeypatch.setattr(graph.node, "create_publisher", lambda *_: SimpleNamespace(publish=publish))
+        monkeypatch.setattr(graph, "spin_for", lambda wait: (waits.append(wait), time.sleep(max(0.0, wait))))
+        topics.publish(graph, arguments)
+    assert len(published) == 10 and max(waits) <= 1.0 / rate
+
+
 @pytest.mark.parametrize("accepted", [True, False])
 def test_ctrl_c_before_a_goal_is_accepted_cancels_it_once_it_is(monkeypatch, connect, accepted):
     calls = importlib.import_module("ros_graph.calls")

@@ -7,12 +7,14 @@ import math
 import numpy as np
 import pytest
 import yaml
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PoseWithCovarianceStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from perch_core.errors import ConfigError
 from perch_msgs.msg import ControllerCommand, MotorCommand, Trajectory
 from ros_graph.commands import GraphError
+from ros_graph.connection import GraphConnection
 from ros_graph.messages import fill, interface, parse, pick, to_yaml
 from ros_graph.topics import rate_summary
 from sensor_msgs.msg import Image, Imu
@@ -44,6 +46,20 @@ def test_long_things_are_cut():
     assert yaml.safe_load(to_yaml(String(data="a" * 200)))["data"] == "a" * 128 + "..."
 
 
+def test_octets_are_numbers():
+    message = fill(DiagnosticStatus(), parse("{level: 2}", "message"))
+    assert message.level == DiagnosticStatus.ERROR and yaml.safe_load(to_yaml(message))["level"] == 2
+    assert to_yaml(pick(message, "level")) == "2\n"
+
+
+@pytest.mark.parametrize("name", ["", "/", "/a//b", "/a/", "/1a", "/bad-name", "/odometry "])
+def test_names_that_ros_refuses_are_refused_in_one_line(name):
+    with pytest.raises(GraphError, match="expected words of letters") as error:
+        GraphConnection.absolute(None, name)
+    assert len(str(error.value).splitlines()) == 1
+    assert GraphConnection.absolute(None, "quad1/odometry") == "/quad1/odometry"
+
+
 def test_parts_of_messages():
     message = PoseWithCovarianceStamped()
     message.pose.pose.position.x = 1.5
@@ -61,6 +77,8 @@ def test_parts_of_messages():
     ("{x: true}", "does not fit double"),
     ("{w: 1}", "w: no such field; there are: x, y, z"),
     ("[1]", "expected fields"),
+    ("[]", "expected fields"),
+    ("0", "expected fields"),
     ("{x: 1", "not valid YAML"),
 ])
 def test_values_that_do_not_fit_are_refused(text, words):
@@ -90,7 +108,7 @@ def test_numbers_that_yaml_takes_for_text_are_numbers():
 
 def test_types_by_name():
     assert interface("std_msgs/msg/String", "msg") is interface("std_msgs/String", "msg") is String
-    for name in ("std_msgs", "std_msgs/msg/Strin", "no_msgs/msg/A", "std_srvs/srv/Trigger"):
+    for name in ("std_msgs", "std_msgs/msg/Strin", "no_msgs/msg/A", "std_srvs/srv/Trigger", "./msg/String"):
         with pytest.raises(GraphError, match="type "):
             interface(name, "msg")
 

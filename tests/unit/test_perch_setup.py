@@ -10,13 +10,16 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 
+import perch_setup
 import pytest
 from perch_core.errors import PerchError
 from perch_eval import extras
 from perch_setup import lock as locking
 from perch_setup import machine, progress, slim, stamps, virtualenv, wheel_paths, workspace
+from perch_setup.environment import variables
 from perch_setup.errors import SetupError
 from perch_setup.layout import EXTRAS, REQUIREMENTS, ROOT
 from perch_setup.machine import INSTALLED, WHEELS, check_python, check_tools, detect_platform
@@ -76,6 +79,28 @@ def test_a_checkout_that_was_moved_says_why_it_is_set_up_again(repository, monke
     assert installed == [True, False] and capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize("fits", [True, False])
+def test_starting_from_nothing_removes_nothing_before_it_is_known_to_be_possible_and_is_noted(repository, monkeypatch, fits):
+    """What is killed while it removes an environment is not taken for a finished set-up."""
+    seen = []
+    monkeypatch.setattr(prepare, "check_tools", lambda: None)
+    monkeypatch.setattr(prepare, "detect_platform", lambda: WHEELS)
+    monkeypatch.setattr(prepare, "setup_lock", nullcontext)
+    monkeypatch.setattr(prepare.stamps, "environment_stamp", lambda wanted: "2")
+    monkeypatch.setattr(prepare, "check_python", lambda wanted: None if fits else machine.check_python(wanted, (3, 13)))
+
+    def install(wanted, fresh):
+        seen.append((fresh, stamps.load()))
+        raise SetupError("killed")
+
+    monkeypatch.setattr(prepare.virtualenv, "install", install)
+    stamps.save({"environment": "1"})
+    with pytest.raises(SetupError, match="killed" if fits else "needs Python"):
+        prepare.prepare(clean=True)
+    assert seen == ([(True, {})] if fits else [])
+    assert stamps.load() == ({} if fits else {"environment": "1"})
+
+
 def test_a_workspace_stays_with_its_installation_in_shells_where_nothing_is_sourced(monkeypatch, tmp_path):
     monkeypatch.setattr(machine, "ROS_PREFIX", tmp_path / "ros_prefix")
     prefix = tmp_path / "opt"
@@ -100,11 +125,29 @@ def test_an_unsupported_python_is_named_with_the_supported_ones(version):
     assert "{}.{}".format(*version) in str(error.value) and error.value.exit_code == 2
 
 
-def test_a_processor_without_wheels_is_refused_unless_ros_is_installed(monkeypatch):
+def test_a_processor_without_wheels_is_refused_unless_ros_is_installed(monkeypatch, tmp_path):
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    monkeypatch.setattr(machine, "ROS_PREFIX", tmp_path / "ros_prefix")
     monkeypatch.setattr(machine.platform, "machine", lambda: "aarch64")
     with pytest.raises(SetupError, match="aarch64.*install ROS 2 Jazzy"):
         check_python(WHEELS, (3, 12))
     check_python(INSTALLED, (3, 12))
+
+
+def test_a_python_that_is_not_that_of_the_installation_is_refused(monkeypatch, tmp_path):
+    for folder in ("share/rclpy", "lib/python3.12/site-packages/rclpy"):
+        (tmp_path / folder).mkdir(parents=True)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    with pytest.raises(SetupError, match=f"{tmp_path} is not for Python 3.11"):
+        check_python(INSTALLED, (3, 11))
+    check_python(INSTALLED, (3, 12))
+
+
+@pytest.mark.parametrize("name", ["my perch", "a:b"])
+def test_a_checkout_in_which_no_executable_would_start_is_refused(monkeypatch, name):
+    monkeypatch.setattr(machine, "ROOT", Path("/work", name))
+    with pytest.raises(SetupError, match="move the checkout"):
+        check_python(WHEELS, (3, 11))
 
 
 def test_each_missing_tool_is_named_with_its_apt_line(monkeypatch):
@@ -116,6 +159,14 @@ def test_each_missing_tool_is_named_with_its_apt_line(monkeypatch):
     text = str(error.value)
     assert "sudo apt-get install cmake g++ python3" in text and "-venv" in text and "-dev" in text
     assert " make" not in text.split("install ")[1]
+
+
+@pytest.mark.parametrize("domain", ["abc", "233", "-1"])
+def test_a_domain_that_ros_cannot_have_is_refused(monkeypatch, domain):
+    monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+    with pytest.raises(SetupError, match=f"ROS_DOMAIN_ID={domain} is not a number from 0 to 232") as error:
+        variables(WHEELS)
+    assert error.value.exit_code == 2
 
 
 # -- the locks -------------------------------------------------------------------------------------------------------
@@ -189,6 +240,7 @@ def test_a_constant_that_kernels_import_changes_their_stamp_and_other_files_do_n
     seen = [stamps.kernel_stamp("environment")]
     (package / "files.py").write_text("def read(): return 1\n")
     assert stamps.kernel_stamp("environment") == seen[0]
+    (package / ".#files.py").symlink_to("somebody@somewhere.1")  # Emacs's lock of a file that is being edited
     for name in ("planet.py", "vehicle.py", "kernels.py"):
         (package / name).write_text((package / name).read_text() + "\n")
         seen.append(stamps.kernel_stamp("environment"))
@@ -329,7 +381,7 @@ def warm_up(tmp_path, monkeypatch):
         "if sys.argv[1] == 'flight': import perch_planner; assert 'perch_msgs' not in sys.modules\n"
         f"open(r'{tmp_path}/' + sys.argv[1], 'w').close()\n"
         f"while sys.argv[1] == 'flight' and not os.path.exists(r'{tmp_path}/built'): time.sleep(0.01)\n"
-        f"sys.exit(os.path.exists(r'{tmp_path}/spoiled'))\n")
+        f"sys.exit(os.path.exists(r'{tmp_path}/spoiled_' + sys.argv[1]))\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(prepare, "WARM_UP", "standing_in")
     monkeypatch.setattr(prepare, "variables", lambda *_, **__: dict(os.environ))
@@ -366,8 +418,9 @@ def test_the_flight_beside_a_failing_build_ends_with_it(warm_up):
     assert "warmed" not in done and not (warm_up / "nodes").exists()  # `Popen`'s context has waited for the end of the flight
 
 
-def test_numerics_that_could_not_be_compiled_are_mentioned_and_left_to_the_first_flight(warm_up, capsys):
-    (warm_up / "built").touch(), (warm_up / "spoiled").touch()
+@pytest.mark.parametrize("part", ["flight", "nodes"])
+def test_numerics_that_could_not_be_compiled_are_mentioned_and_left_to_the_first_flight(warm_up, capsys, part):
+    (warm_up / "built").touch(), (warm_up / f"spoiled_{part}").touch()
     done = {"environment": "1"}
     with prepare._compiled(WHEELS, done):
         pass
@@ -382,6 +435,12 @@ def test_a_failing_tool_is_reported_with_its_last_lines_and_its_log(tmp_path, mo
     assert error.value.exit_code == 1
     assert "step tool" in str(error.value) and "line 29" in str(error.value) and "first" not in str(error.value)
     assert "first" in (tmp_path / "log" / "tool.log").read_text()
+
+
+def test_a_disk_that_is_full_or_of_another_user_ends_the_set_up_in_one_line(capsys):
+    with pytest.raises(SystemExit) as end, perch_setup.setting_up():
+        raise PermissionError(13, "Permission denied", "/work/.perch/lock")
+    assert end.value.code == 1 and capsys.readouterr().err == "perch: set-up failed: [Errno 13] Permission denied: '/work/.perch/lock'\n"
 
 
 def test_a_second_set_up_waits_for_the_first(tmp_path, monkeypatch):
@@ -442,3 +501,8 @@ def test_only_an_installation_of_ros_takes_the_place_of_a_package_of_ours(tmp_pa
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
     names = {folder.name for folder in stamps.packages(platform)}
     assert ("tf2_msgs" in names) is built and {"perch_core", "perch_msgs"} <= names
+    monkeypatch.delenv("AMENT_PREFIX_PATH")  # in a shell where nothing is sourced
+    (tmp_path / "ros_prefix").write_text(str(tmp_path))
+    (tmp_path / "setup.bash").touch()
+    monkeypatch.setattr(machine, "ROS_PREFIX", tmp_path / "ros_prefix")
+    assert names == {folder.name for folder in stamps.packages(platform)}

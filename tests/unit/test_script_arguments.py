@@ -6,10 +6,16 @@ import importlib.util
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
+import bench
 import pytest
+import service
 from perch_eval.arguments import output_folder
+from ros_graph import commands
+from ros_graph.commands import GraphError, NoAnswerError
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -68,6 +74,43 @@ def test_what_can_be_is_accepted(run, name, arguments):
     with pytest.raises(Entered):
         run(name, *arguments)
     assert [path.name for path in Path().iterdir()] == ["file"]  # nothing is left of the trial
+
+
+@pytest.mark.parametrize("error, code", [(GraphError("service /arm does not exist"), 2), (NoAnswerError("/arm: no answer within 30 s"), 1)])
+def test_a_name_that_does_not_exist_is_a_wrong_argument_and_silence_is_a_failure(monkeypatch, capsys, error, code):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(commands, "enter", lambda: None)
+    monkeypatch.setattr("ros_graph.connection.connect", nullcontext)
+    monkeypatch.setattr("ros_graph.calls.call_service", fail)
+    monkeypatch.setattr(sys, "argv", ["service.py", "call", "/arm", "std_srvs/srv/SetBool"])
+    assert commands.carry_out(service.command_line()) == code and capsys.readouterr().err == f"error: {error}\n"
+
+
+def test_ctrl_c_in_a_benchmark_that_waits_for_nodes_ends_all_of_them(monkeypatch):
+    def interrupted(quick):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench, "enter", lambda: None)
+    monkeypatch.setattr(bench, "leave_quietly_on_interrupt", lambda: None)
+    monkeypatch.setattr("importlib.import_module", lambda name: SimpleNamespace(figures=interrupted))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "argv", ["bench.py"])
+    assert bench.main() == 130
+
+
+# -- output ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_stack_whose_output_nobody_reads_any_more_goes_on():
+    """`... | tee` ends by Ctrl-C as well: a reader of a node's output that broke off would end the node while it finishes its recording."""
+    program = f"import sys; sys.path.insert(0, {str(SCRIPTS)!r}); import start_stack as s; show = s.printer(['vehicle']); [show('vehicle', 'x') for _ in '12']"
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run([sys.executable, "-c", program], stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 # -- nodes -----------------------------------------------------------------------------------------------------------

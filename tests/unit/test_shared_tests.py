@@ -35,6 +35,15 @@ def test_every_part_is_taken_once():
     assert [workers.next_part() for _ in script.parts(FILES)] == script.parts(FILES) and workers.next_part() is None
 
 
+@pytest.mark.parametrize("words, chosen", [([], ["-m", "quick", "tests/unit"]), (["tests/unit/test_lines.py"], ["-m", "quick", "tests/unit/test_lines.py"])])
+def test_the_quick_ones_of_a_file_are_those_of_this_file_only(monkeypatch, words, chosen):
+    monkeypatch.setattr(script, "PROCESSES", 1)
+    monkeypatch.setattr(script, "run_pytest", lambda arguments: arguments)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "1")
+    monkeypatch.chdir(script.ROOT)
+    assert script.run_tests(True, False, words) == chosen
+
+
 PROGRAM = """
 import os, sys, pytest, test
 sys.first = os.getpid()
@@ -44,12 +53,13 @@ workers.end(test.run_pytest(["--rootdir=.", "-c", "/dev/null", "-rA", "."], work
 GOOD, BAD, BROKEN = "def test_{0}(one): assert one", "def test_{0}(): assert False", "import no_such_module"
 SHARED = "import pytest\n@pytest.fixture\ndef one(): return 1\n"
 CRASHED = "import os, sys\ndef test_{0}(): os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT) if os.getpid() == sys.first else os.kill(os.getpid(), 11)"
+STOPPED = "def test_{0}(): raise KeyboardInterrupt"
 SKIPPED = "import pytest\npytest.skip('{0}', allow_module_level=True)"
 
 
 @pytest.mark.parametrize("contents, code, words", [
     ((GOOD,) * 9, 0, {"passed": 9}), ((GOOD, SKIPPED), 0, {"passed": 1, "skipped": 2}), ((BAD, GOOD), 1, {"failed": 1, "passed": 1}),
-    ((GOOD, BROKEN, GOOD), 1, {"error": 1}), ((CRASHED, CRASHED), 1, {"passed": 1})])
+    ((GOOD, BROKEN, GOOD), 1, {"error": 1}), ((CRASHED, CRASHED), 1, {"passed": 1}), ((STOPPED, STOPPED), 130, {})])
 def test_two_processes_run_each_part_once_and_whatever_fails_is_told(contents, code, words, tmp_path):
     """Both have collected what is skipped as a file."""
     names = [f"test_{number}.py" for number in range(len(contents))]
