@@ -128,7 +128,8 @@ CONTROLLER = executable("perch_control", "controller")
 
 
 @pytest.mark.parametrize("file, pattern", [
-    ("cmdline", re.escape(f"{sys.executable}\0{SCRIPTS}") + "|" + re.escape(CONTROLLER)), ("cmdline", re.escape(CONTROLLER)), ("maps", "_multiarray_umath"), ("maps", "_rclpy_pybind11")])
+    ("cmdline", re.escape(f"{sys.executable}\0{SCRIPTS}") + "|" + re.escape(CONTROLLER)), ("cmdline", re.escape(CONTROLLER)),
+    ("maps", "_multiarray_umath"), ("maps", "_rclpy_pybind11")])
 def test_ctrl_c_while_run_node_starts_leaves_no_traceback(ros_domain, file, pattern):
     command = [sys.executable, "-S", str(SCRIPTS / "run_node.py"), "controller"]
     assert "Traceback" not in interrupted_once(subprocess.Popen(command, stderr=subprocess.PIPE, text=True), file, pattern)
