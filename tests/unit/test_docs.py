@@ -84,3 +84,11 @@ def test_wheels_named_for_the_companion_computer_are_those_that_are_pinned():
     rows = re.findall(r"^\| ([\w, -]+?) \| ([\d., ]+)", (DOCS / "howto" / "companion_computer.md").read_text(), re.M)
     named = {name: version for names, versions in rows for name, version in zip(names.split(", "), versions.strip().split(", "))}
     assert len(named) >= 10 and {name: pinned.get(name) for name in named} == named
+
+
+@pytest.mark.parametrize("page", ALL, ids=lambda page: str(page.relative_to(ROOT)))
+def test_paragraphs_of_list_items_are_indented_by_four(page):
+    """With less they end the list on the site, and the items that follow are no items."""
+    text = re.sub(r"^( *)```.*?^\1```", lambda block: "x\n" * block[0].count("\n") + "x", page.read_text(), flags=re.S | re.M)
+    lines = text.splitlines()
+    assert [k for k, (above, line) in enumerate(zip(lines, lines[1:]), 2) if not above.strip() and re.match(r" {1,3}\S", line)] == []
