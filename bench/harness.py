@@ -24,7 +24,7 @@ import numpy as np
 from perch_core.processes import without_collector
 
 _STATISTICS = {"median": lambda x: float(np.median(x)),
-               "p99": lambda x: float(np.percentile(x, 99)) if np.isfinite(x).all() else float(np.percentile(x, 99, method="higher")),
+               "p99": lambda x: float(np.percentile(x, 99, method="linear" if np.isfinite(x).all() else "higher")),
                "max": lambda x: float(np.max(x)), "min": lambda x: float(np.min(x))}
 _RELATIONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 

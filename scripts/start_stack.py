@@ -9,13 +9,13 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import re
 import signal
 import sys
 import time
 from pathlib import Path
 
 from perch_setup import ROOT, command_parser, enter, quiet_on_interrupt
+from ros_graph.commands import is_absolute_name
 
 EXAMPLES = """examples:
   python3 scripts/start_stack.py                                       scenario surface_90
@@ -62,7 +62,7 @@ def main() -> int:
         parser.error(f"--view {arguments.view} is outside [0, 65535]")
     if not 0.0 < arguments.ready_timeout < math.inf:
         parser.error(f"--ready-timeout {arguments.ready_timeout} is not > 0 s")
-    if arguments.namespace and not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", arguments.namespace):
+    if arguments.namespace and not is_absolute_name(arguments.namespace):
         parser.error(f"--namespace {arguments.namespace}: must be '/' and a name of letters, digits and '_', as in /quad1")
     if arguments.domain is not None:
         os.environ["ROS_DOMAIN_ID"] = str(arguments.domain)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import sys
 
 from perch_setup import command_parser, enter, quiet_on_interrupt
@@ -17,6 +18,11 @@ class GraphError(Exception):
 
 class NoAnswerError(GraphError):
     """Raised when a part of the graph does not answer in time."""
+
+
+def is_absolute_name(name: str) -> bool:
+    """Return whether a name is an absolute one of ROS, as /quad1/odometry."""
+    return re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", name) is not None
 
 
 class Commands:

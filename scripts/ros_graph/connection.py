@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 import signal
 import time
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from perch_eval.ros.graph_node import GraphNode
-from ros_graph.commands import GraphError, NoAnswerError
+from ros_graph.commands import GraphError, NoAnswerError, is_absolute_name
 
 T = TypeVar("T")
 _SETTLED_S = 0.7
@@ -60,7 +59,7 @@ class GraphConnection(GraphNode):
             GraphError: it is none of ROS.
         """
         absolute = name if name.startswith("/") else f"/{name}"
-        if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", absolute):
+        if not is_absolute_name(absolute):
             raise GraphError(f"name {name!r}: expected words of letters, digits and '_' with '/' between them, as in /quad1/odometry")
         return absolute
 
