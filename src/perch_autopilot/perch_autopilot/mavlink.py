@@ -28,7 +28,7 @@ from perch_autopilot.link import REOPEN, Link, LinkError
 from perch_autopilot.rates import commanded_vehicle
 
 _HANDSHAKE = 3.0                     # for the autopilot's first heartbeat, which come once a second [s]
-_JUMP_SAMPLES = 3                          # samples in a row that do not follow the last one: its clock has clock_jump
+_JUMP_SAMPLES = 3                    # samples in a row that do not follow the last one: its clock has jumped
 _STALE = 100_000_000                 # a command that is older is not sent any more [ns]
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
 _SET_MODE, _ARM_DISARM = 176, 400     # MAV_CMD_DO_SET_MODE, MAV_CMD_COMPONENT_ARM_DISARM

@@ -91,7 +91,7 @@ class BlindDescent:
         b1, b2, b3 = axes_of(self.attitude.q)
         f_W = axpy(accel[0], b1, axpy(accel[1], b2, scale(accel[2], b3)))
         self.v_W = axpy(dt, (f_W[0], f_W[1], f_W[2] - GRAVITY), scale(1.0 - dt / _LEAK, self.v_W))
-        # On the ground the accelerometer reads 1 g; in this descent, while it brakes nothing, `_SHARE` of it.
+        # On the ground the accelerometer reads 1 g; in this descent, while it brakes nothing, `_THRUST_SHARE` of it.
         middle = 0.5 * (1.0 + _THRUST_SHARE) * GRAVITY
         # The mean of the vector: vibration is ten times the difference, and would lengthen a mean of lengths.
         self._f_B = axpy(dt / _MEAN_TIME, axpy(-1.0, self._f_B, accel), self._f_B)

@@ -69,7 +69,7 @@ class Input(_Port, Generic[V]):
             value: type of the values.
             channel: relative name of the topic.
             lazy: values may wait until the next input that is not lazy, at most a few hundredths of a second: a message that
-                wakes a process costs 50 to 100 us, one that is read together with another 5 us.
+                wakes its node costs far more than one that is read together with another (docs/real_time.md).
             answered: the component checks the limits itself, because it answers refused values, too.
         """
         super().__init__(channel)
