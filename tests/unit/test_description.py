@@ -33,6 +33,10 @@ def state(stamp, p=(1.0, 2.0, 3.0), q=(0.0, 0.0, 0.6, 0.8), frame="map"):
     return OdometryState(stamp, p, q, (0.0,) * 3, (0.0,) * 3, ZERO, ZERO, frame)
 
 
+def test_the_urdf_has_no_encoding_declaration_which_lxml_refuses_in_text():
+    assert urdf(load_vehicle("snapdragon")).startswith("<robot ")
+
+
 @pytest.mark.parametrize("name", VEHICLES)
 def test_the_urdf_is_the_vehicle_file(name):
     vehicle, robot = load_vehicle(name), ElementTree.fromstring(urdf(load_vehicle(name)))

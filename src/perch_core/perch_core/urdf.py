@@ -52,7 +52,7 @@ def urdf(vehicle: Vehicle) -> str:
         SubElement(joint, "child", link=frame.child)
         SubElement(joint, "origin", xyz=_text(frame.p), rpy=_text(roll_pitch_yaw(frame.q)))
     ElementTree.indent(robot)
-    return ElementTree.tostring(robot, encoding="unicode", xml_declaration=True) + "\n"
+    return ElementTree.tostring(robot, encoding="unicode") + "\n"
 
 
 def roll_pitch_yaw(q: Sequence[float]) -> tuple[float, float, float]:
