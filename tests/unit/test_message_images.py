@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import array
+import struct
+import zlib
 
+import cv2
 import numpy as np
 import pytest
 from perch_core.errors import PerchError
-from perch_core.ros.messages.sensing import image_message, image_value
-from sensor_msgs.msg import Image
+from perch_core.ros.messages.sensing import compressed_value, image_message, image_value
+from sensor_msgs.msg import CompressedImage, Image
 
 
 def message(encoding, channels, padding=0):
@@ -30,3 +33,37 @@ def test_every_encoding_of_8_bits_is_read_by_rows(encoding, channels, named, pad
 def test_other_encodings_are_refused_with_those_that_are_read():
     with pytest.raises(PerchError, match="'mono16' is not one of mono8, rgb8, bgr8, 8UC1, 8UC3"):
         image_value(message("mono16", 2)[0])
+
+
+@pytest.mark.parametrize("kind", [".png", ".jpg"])
+@pytest.mark.parametrize("shape", [(4, 8), (40, 30, 3)])
+def test_compressed_images_are_read(kind, shape):
+    sent = np.full(shape, 77, np.uint8)
+    image = compressed_value(CompressedImage(format=kind[1:], data=array.array("B", cv2.imencode(kind, sent)[1].tobytes())))
+    assert (image.height, image.width) == shape[:2] and np.abs(image.pixels().astype(int) - sent).max() <= 1
+
+
+def png(width, height):
+    """The few bytes of a PNG that states a size, without its pixels."""
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+
+
+def jpeg(width, height):
+    """A JPEG of 8 x 8 px that states another size, behind a comment that looks like a size."""
+    data = cv2.imencode(".jpg", np.zeros((8, 8), np.uint8))[1].tobytes()
+    size = data.index(b"\xff\xc0") + 5
+    data = data[:size] + struct.pack(">HH", height, width) + data[size + 4 :]
+    comment = b"\xff\xc0\x00\x0b\x08\x00\x08\x00\x08"
+    return data[:2] + b"\xff\xfe" + struct.pack(">H", 2 + len(comment)) + comment + data[2:]
+
+
+@pytest.mark.parametrize("data, why", [
+    (png(20000, 20000), "width: 20000 is outside"), (png(10, 10001), "height: 10001 is outside"), (jpeg(20000, 8), "width: 20000 is outside"),
+    (jpeg(8, 60000), "height: 60000 is outside"), (b"", "no JPEG or PNG"), (png(8, 8)[:20], "no JPEG or PNG"), (b"\xff\xd8\xff\xda\x00\x02", "no JPEG or PNG"),
+    (b"II*\x00" + bytes(100), "no JPEG or PNG"), (b"\xff\xd8" + b"\xff" * 100, "no JPEG or PNG"), (png(8, 8), "no image of 8 bits")])
+def test_a_compressed_image_beyond_the_limits_is_refused_before_it_is_decoded(monkeypatch, data, why):
+    if "no image" not in why:
+        monkeypatch.setattr(cv2, "imdecode", None)
+    with pytest.raises(PerchError, match=why):
+        compressed_value(CompressedImage(format="png", data=array.array("B", data)))

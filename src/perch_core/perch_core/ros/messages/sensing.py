@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import struct
 
 import cv2
 import numpy as np
@@ -11,9 +12,12 @@ from perch_core.camera import camera_of, camera_parameters
 from perch_core.errors import PerchError
 from perch_core.ros.messages.basic import flat, floats, header, quaternion_floats, require_measured, stamp_value, to_quaternion, to_vector
 from perch_core.values import CameraImage, CameraModel, CompressedPixels, ImuSample, StampedTransform, Transform
+from perch_core.values.limits import LIMITS
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
 _GENERIC = {"8UC1": "mono8", "8UC3": "bgr8"}  # what the bytes mean in ROS' generic encodings
+_JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of the segments that state the size of a JPEG
+_JPEG_WITHOUT_LENGTH = frozenset((0x00, 0x01, *range(0xD0, 0xD9)))
 
 
 def imu_value(msg: Imu) -> ImuSample:
@@ -50,8 +54,14 @@ def compressed_value(msg: CompressedImage) -> CameraImage:
     """Convert `sensor_msgs/CompressedImage` (JPEG, PNG) to an image.
 
     Raises:
-        PerchError: it cannot be decoded.
+        PerchError: it cannot be decoded, or its header states a size beyond the limits.
     """
+    size = _stated_size(bytes(msg.data))
+    if size is None:
+        raise PerchError(f"compressed image: {len(msg.data)} bytes of format {msg.format!r} are no JPEG or PNG")
+    for name, pixels in zip(("width", "height"), size):
+        if reason := LIMITS[CameraImage][name].problem(pixels):
+            raise PerchError(f"compressed image: {name}: {reason}")
     try:
         pixels = cv2.imdecode(np.frombuffer(msg.data, np.uint8), cv2.IMREAD_UNCHANGED) if len(msg.data) else None
     except cv2.error:  # more pixels than OpenCV decodes
@@ -60,6 +70,26 @@ def compressed_value(msg: CompressedImage) -> CameraImage:
         raise PerchError(f"compressed image: {len(msg.data)} bytes of format {msg.format!r} are no image of 8 bits per channel")
     encoding = "mono8" if pixels.ndim == 2 else "bgr8"
     return CameraImage(stamp_value(msg.header.stamp), msg.header.frame_id, pixels.shape[1], pixels.shape[0], encoding, pixels)
+
+
+def _stated_size(data: bytes) -> tuple[int, int] | None:
+    """Return width and height [px] by the header of a JPEG or PNG, without decoding it; None if it has none.
+
+    A few kilobytes can state more pixels than fit into memory, and OpenCV gives the size only after it has decoded them.
+    """
+    if data.startswith(b"\x89PNG\r\n\x1a\n") and data[12:16] == b"IHDR" and len(data) >= 24:
+        width, height = struct.unpack_from(">II", data, 16)
+        return width, height
+    if not data.startswith(b"\xff\xd8"):
+        return None
+    at = 2
+    while (at := data.find(b"\xff", at)) >= 0 and at + 9 <= len(data):  # segments: 0xff, marker, length, content
+        marker = data[at + 1]
+        if marker in _JPEG_SIZES:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 1 if marker == 0xff else 2 if marker in _JPEG_WITHOUT_LENGTH else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
 
 
 def compressed_message(image: CompressedPixels) -> CompressedImage:
