@@ -173,6 +173,17 @@ def test_images_wait_for_camera_info():
     assert bench.component.mounted.mount is bench.component.mounted.nominal  # the calibrated camera itself: caches stay
 
 
+@pytest.mark.parametrize(("info", "image", "warned"), [
+    (FRAME, FRAME, ()), (FRAME, "", ()), ("", "tail", ()), ("", "", ()), (FRAME, "tail", ("image_raw: frame 'tail' is not 'camera_front_optical_frame'",)),
+    ("tail", "tail", ("camera_info: frame 'tail' is not 'camera_front_optical_frame'",))])
+def test_a_wrong_frame_of_a_camera_is_named_and_the_image_used(info, image, warned):
+    bench = Bench(known=False)
+    bench.component.on_camera_info(CameraModel(0, info, CAMERA))
+    bench.odometry(0, 200)
+    bench.image(100, frame=image)
+    assert len(bench.exposures) == 1 and [text.partition("/")[2].partition(", ")[0] for text in bench.out.warnings()] == list(warned)
+
+
 def test_another_camera_is_believed_when_it_stays():
     bench = Bench()
     bench.component.on_camera_info(CameraModel(1, FRAME, OTHER))

@@ -78,7 +78,7 @@ class CameraComponent(Component[C], ABC):
             why = "not there" if mount is None else self.rejection_reason(mount)
             raise ConfigError("parameters", "camera",
                               f"{config.camera!r} of {config.sensors if self._calibrated else config.vehicle} is {why}; usable: {', '.join(usable) or 'none'}")
-        self.mounted = MountedCamera(mounts[config.camera], config.extrinsics, self.warn)
+        self.mounted = MountedCamera(mounts[config.camera], self._calibrated, config.extrinsics, self.warn)
         self.dropped = 0
         self._queue: deque[CameraImage] = deque()
         self._topic = self._channel("image")
@@ -123,6 +123,7 @@ class CameraComponent(Component[C], ABC):
         """Queue an image, and use all images that can be used."""
         if self._calibrated and self.mounted.mount is None:
             self.on_camera_info(CameraModel(image.stamp, image.frame, self.mounted.nominal.camera))
+        self.mounted.check_image_frame(self._topic, image.frame)
         self._queue.append(image)
         if len(self._queue) > MAX_QUEUED:
             self._queue.popleft()

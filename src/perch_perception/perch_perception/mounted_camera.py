@@ -11,8 +11,10 @@ from perch_core.camera import Camera
 from perch_core.camera_mount import CameraMount
 from perch_core.values import CameraModel, Transform
 from perch_core.static_transforms import BASE, StaticTransforms
+from perch_core.urdf import optical_frame
 
 CONFIRMATIONS = 5  # camera_info in a row with other intrinsics, after which the change is accepted
+REMINDER = 60.0    # between warnings of a frame's name [s]
 
 
 class MountedCamera:
@@ -20,6 +22,7 @@ class MountedCamera:
 
     Args:
         nominal: the camera as the vehicle file or sensor file describes it.
+        calibrated: `nominal` is of a sensor file, whose user chooses the frames' names.
         extrinsics: `file`: those of `nominal`; `tf`: the pose of the camera's optical frame in `/tf_static`.
         warn: called with a warning and the least time between two of its kind [s].
 
@@ -27,10 +30,11 @@ class MountedCamera:
         mount: the camera; None until it is known. With `file` and intrinsics equal to the nominal ones it is `nominal` itself.
     """
 
-    def __init__(self, nominal: CameraMount, extrinsics: str, warn: Callable[[str, float], None]) -> None:
+    def __init__(self, nominal: CameraMount, calibrated: bool, extrinsics: str, warn: Callable[[str, float], None]) -> None:
         self.nominal = nominal
         self.mount: CameraMount | None = None
         self._by_transforms, self._warn = extrinsics == "tf", warn
+        self._expects_frame = extrinsics == "file" and not calibrated
         self._transforms = StaticTransforms()
         self._camera: Camera | None = None
         self._frame, self._topic = "", f"camera_{nominal.name}/camera_info"
@@ -50,15 +54,20 @@ class MountedCamera:
             return ""
         return f"no {self._topic} yet" if self._camera is None else f"no transform of {self._frame!r} in {BASE} on /tf_static yet"
 
+    def check_image_frame(self, topic: str, frame: str) -> None:
+        """Warn if an image's frame is not that of `camera_info`; no name counts as the right one."""
+        if frame != self._frame and frame and self._frame:
+            self._warn(f"{topic}: frame {frame!r} is not {self._frame!r}, that of {self._topic}: images are used, but may be of another camera", REMINDER)
+
     def take_model(self, model: CameraModel) -> bool:
         """Take the camera's intrinsics; return whether `mount` has changed."""
-        camera = model.camera
+        camera, expected = model.camera, optical_frame(self.nominal.name)
+        if self._expects_frame and model.frame not in (expected, ""):
+            self._warn(f"{self._topic}: frame {model.frame!r} is not {expected!r}, whose pose in the vehicle file is used", REMINDER)
         if camera is self._camera or camera == self._camera:
             self._other_count = 0
-            if self._by_transforms and model.frame != self._frame:
-                self._frame = model.frame
-                return self._place()
-            return False
+            renamed, self._frame = model.frame != self._frame, model.frame
+            return renamed and self._by_transforms and self._place()
         if self._camera is not None and not self._is_confirmed(camera):
             return False
         self._camera = self.nominal.camera if camera == self.nominal.camera else camera
