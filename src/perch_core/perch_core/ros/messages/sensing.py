@@ -59,8 +59,8 @@ def compressed_value(msg: CompressedImage) -> CameraImage:
     size = _stated_size(bytes(msg.data))
     if size is None:
         raise PerchError(f"compressed image: {len(msg.data)} bytes of format {msg.format!r} are no JPEG or PNG")
-    for name, pixels in zip(("width", "height"), size):
-        if reason := LIMITS[CameraImage][name].problem(pixels):
+    for name, n in zip(("width", "height"), size):
+        if reason := LIMITS[CameraImage][name].problem(n):
             raise PerchError(f"compressed image: {name}: {reason}")
     try:
         pixels = cv2.imdecode(np.frombuffer(msg.data, np.uint8), cv2.IMREAD_UNCHANGED) if len(msg.data) else None
