@@ -110,6 +110,23 @@ with quiet_on_interrupt():
     assert (process.returncode, error) == (130, "")
 
 
+def test_ctrl_c_that_was_blocked_and_ignored_reaches_a_handler_that_is_set_later():
+    """As for `run_node.py ... &` in a shell script, in which rclpy's own nodes end on SIGINT, too."""
+    code = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+from perch_core.interrupts import quiet_on_interrupt
+with quiet_on_interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+from perch_core.ros.node import StopSignal
+stop = StopSignal()
+os.kill(os.getpid(), signal.SIGINT)
+sys.exit(7)
+"""
+    assert subprocess.run([sys.executable, "-c", code], timeout=300.0).returncode == 0
+
+
 def interrupted_once(process: subprocess.Popen, file: str, pattern: str) -> str:
     """What a process says after SIGINT at the moment when a pattern is found in a file of its /proc."""
     place, end = Path(f"/proc/{process.pid}/{file}"), time.monotonic() + 60.0

@@ -13,14 +13,18 @@ INTERRUPTED = 130  # exit code
 def quiet_on_interrupt() -> Iterator[None]:
     """Let Ctrl-C end the process without a traceback during imports, which take seconds; another handler of SIGINT is kept.
 
-    A Ctrl-C that `scripts/run_node.py` blocked while Python started takes effect here.
+    A Ctrl-C that `scripts/run_node.py` blocked while Python started takes effect here. SIGINT is unblocked in any case: where
+    it is ignored, as in a shell's background jobs, it is so until the node sets its own handler, as rclpy does.
     """
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is signal.default_int_handler:
+        signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if handler is signal.default_int_handler:
+            signal.signal(signal.SIGINT, handler)
