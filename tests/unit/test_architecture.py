@@ -9,7 +9,7 @@ MIDDLE = {"perch_planner", "perch_control", "perch_perception", "perch_sim", "pe
 ALLOWED = {"perch_core": {"perch_core"}, "perch_eval": MIDDLE | {"perch_core", "perch_eval"}} | {
     name: {"perch_core", name} for name in MIDDLE}
 ROS = ("rclpy", "rcl_interfaces", "builtin_interfaces", "geometry_msgs", "nav_msgs", "sensor_msgs", "std_msgs", "std_srvs",
-       "diagnostic_msgs", "visualization_msgs", "rosgraph_msgs", "perch_msgs", "tf2_msgs")
+       "diagnostic_msgs", "visualization_msgs", "rosgraph_msgs", "perch_msgs", "tf2_msgs", "ament_index_python")
 SOURCES = sorted(p for package in ALLOWED for p in (ROOT / "src" / package / package).rglob("*.py"))
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from perch_core.errors import PerchError
 from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
@@ -87,13 +87,11 @@ def executable(package: str, name: str) -> str:
     Raises:
         PerchError: the package or the executable is not installed.
     """
-    try:
-        path = Path(get_package_prefix(package)) / "lib" / package / name
-    except PackageNotFoundError:
-        raise PerchError(f"package {package} is not found: source setup.bash first") from None
-    if not path.exists():
-        raise PerchError(f"executable {name} is not installed in {path.parent}: run scripts/setup.py")
-    return str(path)
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        path = Path(prefix, "lib", package, name)
+        if prefix and path.exists():
+            return str(path)
+    raise PerchError(f"executable {name} of package {package} is not found: run scripts/setup.py, then source setup.bash")
 
 
 def ros_arguments(launch: NodeLaunch, folder: Path, namespace: str = "") -> list[str]:
