@@ -96,9 +96,8 @@ def _start(work, *arguments) -> BaseProcess:
 
 def _work_until_parent_ends(parent: int, work, *arguments) -> None:
     """Call `work` in a process that ends with its parent, also with one that is killed or ends at once on Ctrl-C."""
-    end_with_parent(signal.SIGKILL)
-    if os.getppid() == parent:
-        work(*arguments)
+    end_with_parent(signal.SIGKILL, parent)
+    work(*arguments)
 
 
 def _schedule(policy: str, priority: int) -> None:

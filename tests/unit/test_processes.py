@@ -6,6 +6,8 @@ import signal
 import subprocess
 import sys
 
+import pytest
+
 
 def _run(script: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
@@ -13,6 +15,12 @@ def _run(script: str) -> subprocess.CompletedProcess[str]:
 
 def test_a_process_that_does_not_end_is_ended():
     assert _run("from perch_core.processes import end_within\nend_within(1)\nwhile True: pass").returncode == -signal.SIGALRM
+
+
+@pytest.mark.parametrize("parent, code", [("os.getppid()", 5), ("os.getppid() + 1", -signal.SIGTERM), ("None", 5)])
+def test_a_process_whose_parent_has_already_ended_ends_at_once(parent, code):
+    script = f"import os, signal, sys\nfrom perch_core.processes import end_with_parent\nend_with_parent(signal.SIGTERM, {parent})\nsys.exit(5)"
+    assert _run(script).returncode == code
 
 
 def test_what_is_started_without_interrupts_does_not_see_them():

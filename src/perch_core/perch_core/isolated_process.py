@@ -49,9 +49,7 @@ def _out_of_memory_text(memory: int) -> str:
 
 def _child(pipe: Connection, supervisor: int, memory: int) -> None:
     """Execute jobs until the pipe closes."""
-    end_with_parent(signal.SIGKILL)
-    if os.getppid() != supervisor:
-        os._exit(0)
+    end_with_parent(signal.SIGKILL, supervisor)
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     while True:
@@ -143,9 +141,7 @@ def _run(job: bytes, child: Connection, upstream: Connection, pid: int, memory: 
 
 def main() -> None:
     """Serve a pipe; the last two arguments of the command line are its file descriptor and the caller's process id."""
-    end_with_parent(signal.SIGKILL)
-    if os.getppid() != int(sys.argv[-1]):
-        return
+    end_with_parent(signal.SIGKILL, int(sys.argv[-1]))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller decides when this ends
     supervise(Connection(int(sys.argv[-2])))
 

@@ -17,10 +17,17 @@ _SET_THREADS = ("openblas_set_num_threads", "openblas_set_num_threads64_", "scip
 """Names of the same OpenBLAS function in the builds of Linux, numpy and scipy."""
 
 
-def end_with_parent(signal_number: int) -> None:
-    """Have the operating system send this process a signal when its parent ends, for whatever reason (Linux)."""
+def end_with_parent(signal_number: int, parent: int | None = None) -> None:
+    """Have the operating system send this process a signal when its parent ends, for whatever reason (Linux).
+
+    Args:
+        signal_number: the signal.
+        parent: process id of the parent: the signal is sent now if it has already ended; None: this is not checked.
+    """
     with suppress(OSError, AttributeError):  # elsewhere a process ends with its pipes
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal_number))
+    if parent is not None and os.getppid() != parent:
+        signal.raise_signal(signal_number)
 
 
 def end_within(seconds: int) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 
 from perch_core.processes import end_with_parent
 
+SERVER = os.getpid()  # of the fork server, also in the processes that it forks
 end_with_parent(signal.SIGKILL)

@@ -66,11 +66,10 @@ def session(leader: int) -> list[int]:
 
 def _run_node(what: str, arguments: tuple[str, ...], log: Path, environment: dict[str, str]) -> None:
     """Turn the forked process into the node and run it."""
+    from perch_eval import ended_with_caller  # loaded in the fork server alone: its import ends a process with its parent
+
     os.setsid()
-    end_with_parent(signal.SIGKILL)
-    caller = multiprocessing.parent_process()
-    if caller is not None and not caller.is_alive():  # and the fork server with it, before `end_with_parent` took effect
-        os._exit(1)
+    end_with_parent(signal.SIGKILL, ended_with_caller.SERVER)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     file, nothing = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), os.open(os.devnull, os.O_RDONLY)
     for target, source in ((0, nothing), (1, file), (2, file)):

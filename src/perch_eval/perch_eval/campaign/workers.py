@@ -42,10 +42,8 @@ def prepare_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # what the worker starts has signals of its own
     signal.signal(signal.SIGTERM, _on_terminate)
-    end_with_parent(signal.SIGTERM)
     campaign = multiprocessing.parent_process()
-    if campaign is not None and os.getppid() != campaign.pid:  # it has ended while this worker was starting
-        os._exit(1)
+    end_with_parent(signal.SIGTERM, None if campaign is None else campaign.pid)
 
 
 def _call(work: Callable[[T], R], item: T) -> R:
