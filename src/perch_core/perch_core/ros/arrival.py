@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from perch_core.component import Action, Component, Input, Service, Timer, ports
+from perch_core.component import Action, Client, Component, Input, Service, Timer, ports
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.deadlines import Deadlines
 from perch_core.ros.intake import Intake
@@ -45,8 +45,8 @@ class ArrivalNode(ComponentNode):
             self._intake.add(port)
         for timer in ports(type(self.component), Timer):
             self._create_component_timer(timer)
-        for name, send in connect_clients(self, self.component).items():
-            setattr(self.component, name, partial(self._send_request, name, send))
+        for client, send in connect_clients(self, self.component).items():
+            setattr(self.component, client.name, partial(self._send_request, client, send))
         self.serve()
         if self._intake.private:
             self.create_timer(CHECK_PERIOD, self._warn_foreign_publishers, clock=self._steady)
@@ -68,9 +68,9 @@ class ArrivalNode(ComponentNode):
         """Call `work` at once."""
         self.wiring.enter(self.guarded, port.name, work, *arguments)
 
-    def _send_request(self, name: str, send: Send, request: Any, due: int) -> None:
+    def _send_request(self, port: Client[Any, Any], send: Send, request: Any, due: int) -> None:
         """Send a component's request; its answer arrives when it does, whatever `due`."""
-        send(request, partial(self.wiring.enter, self.guarded, name, getattr(self.component, f"on_{name}")))
+        send(request, partial(self.wiring.enter, self.guarded, port.name, port.handler(self.component)))
 
     # -- diagnostics and priority --------------------------------------------------------------------------------------
 

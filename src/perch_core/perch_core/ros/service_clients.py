@@ -19,17 +19,17 @@ WATCH_PERIOD = 1.0       # of the check for new servers [s]
 Send = Callable[[Any, Callable[[Any], None]], None]
 
 
-def connect_clients(node: Node, component: Component[Any]) -> dict[str, Send]:
+def connect_clients(node: Node, component: Component[Any]) -> dict[Client[Any, Any], Send]:
     """Create the clients of a component.
 
     Returns:
-        Name of the port -> function (request, take) that sends a request; `take(answer)` is called on the executor's thread.
+        Port -> function (request, take) that sends a request; `take(answer)` is called on the executor's thread.
     """
-    functions: dict[str, Send] = {}
+    functions: dict[Client[Any, Any], Send] = {}
     for port in ports(type(component), Client):
         row = topics.service(port.channel(component))
         client = node.create_client(row.type, port.channel(component))
-        functions[port.name] = _client_function(node, row, client)
+        functions[port] = _client_function(node, row, client)
         _watch_servers(node, component, client)
     return functions
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from perch_core.component import Action, Client, Component, Input, Service, Unavailable, ports
+from perch_core.component import Action, Component, Input, Service, Unavailable, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.service_clients import Send, connect_clients
@@ -63,8 +63,7 @@ class ParticipantNode(ComponentNode):
 
     def connect(self) -> None:
         """Offer services and connect clients; if the vehicle is in another process, connect to it."""
-        senders = connect_clients(self, self.component)
-        self._request_senders = {port.channel(self.component): senders[port.name] for port in ports(type(self.component), Client)}
+        self._request_senders = {port.channel(self.component): send for port, send in connect_clients(self, self.component).items()}
         self.serve()
         for observed in self._observed:
             self._intake.add(observed)
