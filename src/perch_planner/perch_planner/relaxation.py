@@ -24,10 +24,10 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Found, Outcome, Search
 
-PROGRAMS_MAX = 300
+PROGRAMS_MAX = 400
 """Greatest number of quadratic programs in all searches with relaxed limits."""
-_PROGRAMS_PER_TRIAL = 45  # of one of them
-_VALUE_TRIALS = 3         # of values: what the plan took of a limit, then halves of the logarithm
+_PROGRAMS_PER_TRIAL = 100 # of one of them
+_VALUE_TRIALS = 5         # of values: what the plan took of a limit, then halves of the logarithm
 _SHARE_MIN = 1 / 64       # of what a plan takes beyond a limit that was removed; less is not tried
 
 

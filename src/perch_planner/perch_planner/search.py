@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,10 +16,10 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_h
 from perch_planner.rotor_thrusts import rotor_model
 from perch_planner.segment_program import COST_ORDER, SegmentProgram
 from perch_planner.time_allocation import (
-    FINE_DIVISIONS, LAST_SEGMENT_MIN, allocate, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
+    FINE_DIVISIONS, allocate, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
 from perch_planner.yaw_profile import yaw_coefficients
 
-STARTS = ((1.0, 100), (1.25, 75), (0.8, 75))
+STARTS = ((1.0, 100), (1.25, 75), (0.8, 75), (0.6, 50), (0.45, 40))
 """First durations of a search, as factors of the allocated ones, and the greatest number of quadratic programs from each."""
 ITERATIONS_MAX = sum(programs for _, programs in STARTS)
 _CUT_ROUNDS = 24
@@ -26,7 +27,7 @@ _EARLY_STRETCHES = 5      # so often, peaks are stretched where a longer time he
 _SMALL_VIOLATION = 0.03   # violations of the thrust range below this share are cut together with the other limits
 _DEFAULT_STRETCH = 1.15
 _BISECTIONS = 12
-_SHORTENING_MAX = 100     # quadratic programs
+_SHORTENING_MAX = 200     # quadratic programs
 _COARSE_TRIALS = 3        # so many durations are tried with few last pieces first, which cost least; from the last of them on with all divisions
 _SMALL_STEPS = 6          # so often the approach becomes a quarter longer, then by more
 _APPROACH_GROWTH = (1.25, 1.6)
@@ -227,23 +228,29 @@ class Search:
         return bool(((before[:, 4] > self.high) | (before[:, 1] < self.low)).any())
 
     def shortest(self, found: Found) -> Outcome:
-        """Bisect the scale of all durations for the shortest plan whose limits are still proved, in about `_SHORTENING_MAX` programs.
+        """Bisect the duration for the shortest plan whose limits are still proved, in about `_SHORTENING_MAX` programs.
 
-        The approach is divided as in the plan that was found, or else coarsely.
+        As under a tighter `duration_max`: the segments are shortened, and every division of the approach is tried.
         """
         durations, fails, outcome = found
         self._iterations_end = self.iterations + _SHORTENING_MAX
-        shortest = max(self.settings.tube_time, LAST_SEGMENT_MIN)
-        low, high = min(shortest / durations[-1], 1.0), 1.0
+        low, high = 0.0, float(durations.sum())
         for _ in range(_BISECTIONS):
-            if high - low < 1e-3 or self.iterations >= self._iterations_end:
+            if high - low < 1e-3 * high or self.iterations >= self._iterations_end:
                 break
             middle = 0.5 * (low + high)
-            tried = self.try_durations(divided_durations(middle * durations, fails))
-            if not tried.proved and division_index(fails) < len(FINE_DIVISIONS):
-                tried = self.try_durations(split_last(middle * durations))
-            if tried.proved:
-                high, outcome = middle, tried
-            else:
+            tried = self._try_divisions(shortened(durations, replace(self.settings, duration_max=middle)), fails)
+            if tried is None:
                 low = middle
+            else:
+                high, outcome = middle, tried
         return outcome
+
+    def _try_divisions(self, durations: np.ndarray | None, first: int) -> Outcome | None:
+        """Return a plan with these durations and any division of the approach; that after `first` failures is tried first."""
+        for fails in (first, *range(_COARSE_TRIALS - 1, _COARSE_TRIALS + len(FINE_DIVISIONS))):
+            if durations is not None and self.iterations < self._iterations_end:
+                tried = self.try_durations(divided_durations(durations, fails))
+                if tried.proved:
+                    return tried
+        return None
