@@ -26,9 +26,11 @@ def test_a_page_says_of_which_code_it_is_and_how_it_was_made(page):
 
 
 @pytest.mark.parametrize("data", sorted(RESULTS.rglob("*.json")), ids=lambda data: str(data.relative_to(RESULTS)))
-def test_figures_say_of_which_code_they_are(data):
+def test_figures_say_of_which_code_they_are_and_how_they_were_made(data):
     figures = json.loads(data.read_text())
     assert re.fullmatch(r"[0-9a-f]{7}\+?", figures["commit"]) and re.fullmatch(r"[0-9a-f]{12}", figures["digest"])
+    assert re.match(r"python3 (scripts|bench)/\w+\.py", figures["command"]) and figures["machine"]
+    assert "seed" in data.read_text() or data.parent.name == "recordings"  # nothing is drawn there
 
 
 @pytest.mark.skipif(not NOW, reason="not in a git repository")
@@ -81,6 +83,17 @@ def test_a_page_is_marked_once_the_code_has_changed(tmp_path, monkeypatch):
     monkeypatch.setattr(revision, "digest", lambda: "ba9876543210")
     assert revision.mark([page]) == [page] and revision.mark([page]) == []
     assert "> **Of commit 1234567, older than the code** (digest 0123456789ab)." in page.read_text()
+
+
+def test_the_marking_explains_itself_and_marks_the_pages_of_its_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(revision, "digest", lambda: "0123456789ab")
+    page = tmp_path / "page.md"
+    page.write_text("# Results\n\n> **Of commit 1234567** (digest ba9876543210).\n")
+    with pytest.raises(SystemExit, match="0"):
+        revision.main(["--help"])
+    assert "PAGE" in capsys.readouterr().out and revision.OLDER not in page.read_text()
+    revision.main([str(page)])
+    assert capsys.readouterr().out == f"{page}: older than the code\n" and revision.OLDER in page.read_text()
 
 
 def test_results_are_of_the_code_whose_digest_they_have_whatever_was_committed_meanwhile(monkeypatch):

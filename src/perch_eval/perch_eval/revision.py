@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Collection, Iterable
@@ -63,6 +65,11 @@ def code_version() -> dict[str, str]:
     return {"commit": commit(), "digest": digest()}
 
 
+def command_line() -> str:
+    """Return the command that this process was started by, as a user writes it."""
+    return shlex.join(["python3", *sys.argv])
+
+
 def banner(commits: Collection[str], codes: Collection[str]) -> str:
     """Return the banner of a results page: its commits, whether they are older than the code, and how to list the changes since
     the oldest of them, or since where their histories part.
@@ -90,11 +97,19 @@ def mark(pages: Iterable[Path]) -> list[Path]:
     for path in pages:
         page = path.read_text()
         if out_of_date(page, now):
-            path.write_text(re.sub(r"(> \*\*Of commits? [^*\n]*?)\.?\*\*", rf"\g<1>{OLDER}**", page, count=1))
+            path.write_text(re.sub(r"(\*\*[Oo]f commits? [^*\n]*?)\.?\*\*", rf"\g<1>{OLDER}**", page, count=1))
             marked.append(path)
     return marked
 
 
-if __name__ == "__main__":
-    for page in mark(map(Path, sys.argv[1:]) if sys.argv[1:] else sorted((root() / "docs" / "results").rglob("*.md"))):
+def main(arguments: list[str] | None = None) -> None:
+    """Mark the pages of the command line, by default all results and README.md, and print those that were not marked yet."""
+    parser = argparse.ArgumentParser(prog="python3 -m perch_eval.revision", description="Mark the pages that were made by other code.")
+    parser.add_argument("pages", nargs="*", type=Path, metavar="PAGE", help="page with a banner (default: all of docs/results, and README.md)")
+    pages = parser.parse_args(arguments).pages or [*sorted((root() / "docs" / "results").rglob("*.md")), root() / "README.md"]
+    for page in mark(pages):
         print(f"{page}: older than the code")
+
+
+if __name__ == "__main__":
+    main()
