@@ -45,9 +45,11 @@ def test_what_was_flown_before_a_soak_was_killed_is_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(soak, "fly", fly)
     monkeypatch.setattr(soak, "plot", lambda _, file: file.touch())
+    monkeypatch.setattr("sys.argv", ["scripts/soak.py", "--out", str(tmp_path)])
     with pytest.raises(Killed):
         soak.main(["--out", str(tmp_path), "--logs", str(tmp_path)])
-    assert "20 of 20 flights perched and departed" in (tmp_path / "README.md").read_text()
+    page = (tmp_path / "README.md").read_text()
+    assert "20 of 20 flights perched and departed" in page and f"Made by `python3 scripts/soak.py --out {tmp_path}` on " in page
     assert (tmp_path / "surface_90.json").exists() and (tmp_path / "surface_90.png").exists()
 
 

@@ -24,7 +24,7 @@ from perch_eval.domain import domain_in_environment
 from perch_eval.evaluation.document import machine, table
 from perch_eval.modelled_sight_node import imageless_launches, imageless_programs
 from perch_eval.nodes import FAST_NODES, node_programs, programs, sharing
-from perch_eval.revision import banner, code_version
+from perch_eval.revision import banner, code_version, command_line
 from perch_eval.ros.mission_client import MissionClient
 from perch_eval.stack import Stack, StackError
 from perch_sim.scenario import load_scenario
@@ -203,15 +203,16 @@ def page(folder: Path) -> str:
     """Return the page of all soak runs whose results are in a folder."""
     runs = {file: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
     text = ["# Soak", "", banner([run["commit"] for run in runs.values()], [run.get("digest", "") for run in runs.values()]), "",
-            "Made by `python3 scripts/soak.py`. This page is generated. One run of the stack over ROS in lockstep: perch, depart,",
-            f"perch again. Growth of memory by least squares over the flights after the first {WARM_UP_FLIGHTS}; "
-            f"required: at most {MAX_GROWTH:g} MB per 100 flights,",
-            "descriptors and threads constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
+            "This page is generated. Each run is of the stack over ROS in lockstep: perch, depart, perch again. Growth of memory by",
+            f"least squares over the flights after the first {WARM_UP_FLIGHTS}; required: at most {MAX_GROWTH:g} MB per 100 flights, "
+            "descriptors and threads",
+            "constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
     for file, run in runs.items():
         good = sum(flight["departed"] and flight["outcome"] == "perched" for flight in run["flights"])
         sight = "with cameras" if run["cameras"] else "without cameras (error models in their place)"
         minutes = run["flights"][-1]["time"] / 60.0
-        text += ["", f"## {file.stem}", "", f"`{run['scenario']}`, seed {run['seed']}, {sight}; {run['commit']}, {run['machine']}.",
+        text += ["", f"## {file.stem}", "", f"Made by `{run['command']}` on {run['machine']}, commit {run['commit']}.", "",
+                 f"`{run['scenario']}`, seed {run['seed']}, {sight}.",
                  f"{good} of {len(run['flights'])} flights perched and departed, {minutes:.1f} min of simulated time in "
                  f"{run['wall_s'] / 60.0:.1f} min.",
                  "", *table("process | first [MB] | last [MB] | growth [MB per 100 flights] | descriptors | threads", (
@@ -272,7 +273,7 @@ def _write(args: argparse.Namespace, code: Mapping[str, str], began: float, flig
     name, problems = args.name or Path(args.scenario).stem, find_problems(flights)
     plot(flights, args.out / f"{name}.png")
     (args.out / f"{name}.json").write_text(json.dumps({
-        **code, "scenario": args.scenario, "seed": args.seed, "cameras": args.cameras, "machine": machine(),
+        **code, "command": command_line(), "machine": machine(), "scenario": args.scenario, "seed": args.seed, "cameras": args.cameras,
         "wall_s": round(time.monotonic() - began, 1), "problems": problems, "growth": growth(flights),
         "flights": [asdict(flight) for flight in flights]}, separators=(",", ":")) + "\n")
     (args.out / "README.md").write_text(page(args.out))
