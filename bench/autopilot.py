@@ -23,6 +23,7 @@ from perch_eval.in_process import Loop, arrange
 from perch_eval.metrics import tilt_degrees
 from perch_sim.scenario import load_scenario
 
+SEEDS = "1"
 SCENARIO = replace(load_scenario("surface_90"), vehicle="betaflight")
 LEVEL = 10.0                              # tilt that counts as level [deg]
 PHASES = {"take-off": ("take_off", 0.6), "hover": ("searching", 0.3), "way to the wall": ("tracking", 0.5),

@@ -19,6 +19,7 @@ from perch_control.reference import FlatReference
 from perch_control.rotor_lag import RotorEstimate
 from perch_core.vehicle import ControlGains, load_vehicle
 
+SEEDS = "none: nothing is random"
 VEHICLE = load_vehicle("snapdragon")
 
 

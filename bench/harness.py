@@ -2,6 +2,7 @@
 
     # bench/<group>.py, run by `python3 scripts/bench.py <group>`
     from harness import Figure, figure, measure
+    SEEDS = "1"                                                                      # of its random problems, in words
     def figures(quick: bool) -> list[Figure]:
         step = measure(controller_step, repetitions=200 if quick else 5000)          # seconds per call
         return [figure("control step", "us", 1e6 * step, bar=50.0),                  # median <= 50 us holds?
@@ -100,9 +101,16 @@ def machine() -> dict[str, object]:
             "python": platform.python_version(), "numpy": np.__version__, "system": platform.platform()}
 
 
-def as_json(group_figures: dict[str, list[Figure]], code: Mapping[str, str]) -> dict[str, object]:
-    """Return the figures in their common JSON form; `code`: from `code_version()` before they were measured."""
-    return {**code, "machine": machine(),
+def as_json(group_figures: dict[str, list[Figure]], code: Mapping[str, str], command: str, seeds: Mapping[str, str]) -> dict[str, object]:
+    """Return the figures in their common JSON form.
+
+    Args:
+        group_figures: figures of each group.
+        code: from `code_version()` before they were measured.
+        command: that measured them.
+        seeds: of each group's random problems, in words.
+    """
+    return {**code, "command": command, "machine": machine(), "seeds": seeds,
             "figures": [{"group": group, **asdict(item)} for group, items in group_figures.items() for item in items]}
 
 

@@ -7,6 +7,8 @@ import perception_tags
 import perception_vio
 from harness import Figure
 
+SEEDS = "lines: scene 1, flights from 0; tags: 5; VIO: flights from 0, IMU 1"
+
 
 def figures(quick: bool) -> list[Figure]:
     """The figures of all parts."""

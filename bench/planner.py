@@ -24,6 +24,7 @@ from perch_planner.planner import plan
 from perch_planner.problem import PerchSettings
 from perch_planner.refusals import PerchRefusal
 
+SEEDS = "problems: from 0, one each; polynomials: from 0, one each"
 _CHUNK = 100  # polynomials
 _FIRST_PLAN = """
 import time; begin = time.perf_counter()

@@ -34,6 +34,7 @@ from perch_planner.powerline.starts import random_start
 from perch_planner.powerline.visibility import visibility
 from perch_planner.powerline_planner import PowerlinePlannerParameters
 
+SEEDS = "starts of the five cases: 2026; starts anywhere: 2027 with their number"
 SOLVE_BARS = {"line_20": 15.0, "line_80": 20.0, "line_20_pa": 30.0, "line_80_pa": 30.0, "line_180": 40.0}  # medians; p99: twice that [ms]
 PUBLISHED = {"deg90_published": 1.861, "upside_down_published": 2.485}  # [s]
 ORACLE_SAMPLE = 20  # of the planned starts anywhere, to see what that IPOPT finds

@@ -31,6 +31,7 @@ from perch_msgs.msg import MotorCommand
 from perch_sim.scenario import Scenario, load_scenario
 from sensor_msgs.msg import Imu
 
+SEEDS = "flights: from 1, one each; the rest: 1"
 CHAIN = ("vehicle", "vio_model", "estimator", "controller")  # the stand-in VIO: nothing here is about estimation
 ARM = CommandMessage.ARM
 RATES = {"imu/data_raw": Imu, "odometry": Odometry, "motor_command": MotorCommand}

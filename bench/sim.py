@@ -11,6 +11,7 @@ from perch_core.vehicle import load_vehicle
 from perch_sim.rendering import Renderer, build_scene
 from perch_sim.scenario import Cable, Scenario, World, load_scenario
 
+SEEDS = "noise of the images: 0"
 WIRES = tuple(Cable(start=(5.0 + 0.5 * i, -4.0, 2.2 + 0.4 * i), end=(5.0 + 0.5 * i, 4.0, 2.3 + 0.4 * i), sag=0.15)
               for i in range(3))
 

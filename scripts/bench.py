@@ -41,7 +41,7 @@ def main() -> int:
     sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "oracles")]  # the closed loop and the oracles of the tests
     import harness
     from perch_core.json_values import write_json
-    from perch_eval.revision import code_version
+    from perch_eval.revision import code_version, command_line
 
     code = code_version() if arguments.json else {}
     results, failed = {}, False
@@ -58,7 +58,8 @@ def main() -> int:
         print(harness.table(results[group]), flush=True)
         failed |= any(item.holds is False for item in results[group])
     if arguments.json:
-        write_json(arguments.json, harness.as_json(results, code))
+        seeds = {group: sys.modules[group].SEEDS for group in results}
+        write_json(arguments.json, harness.as_json(results, code, command_line(), seeds))
     return 1 if failed else 0
 
 

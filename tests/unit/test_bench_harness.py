@@ -43,8 +43,9 @@ def test_measure_counts_only_after_the_warm_up():
 
 def test_json_and_table_name_every_figure():
     items = [harness.figure("plan", "ms", [0.3], bar=0.5), harness.figure("import", "s", [1.0])]
-    written = harness.as_json({"planner": items}, {"commit": "1234567", "digest": "0123456789ab"})
+    written = harness.as_json({"planner": items}, {"commit": "1234567", "digest": "0123456789ab"}, "python3 scripts/bench.py", {"planner": "from 0"})
     assert written["machine"]["cores"] >= 1 and (written["commit"], written["digest"]) == ("1234567", "0123456789ab")
+    assert written["command"] == "python3 scripts/bench.py" and written["seeds"] == {"planner": "from 0"}
     assert [f["name"] for f in written["figures"]] == ["plan", "import"]
     assert {"name", "unit", "median", "p99", "n", "bar", "holds"} <= set(written["figures"][0])
     assert "holds" in harness.table(items) and "import" in harness.table(items)
