@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -104,10 +106,45 @@ def test_an_answer_that_comes_after_its_request_was_dropped_is_not_that_of_the_n
     asking.component.plan_perch(REQUEST, 0)
     until(executor, lambda: len(replies) == 1)
     monkeypatch.setattr("perch_sim.ros.participant_node.ANSWER_TIMEOUT", -1.0)
-    asking._expire_requests()
+    asking._check_requests()
     asking.component.plan_perch(REQUEST, 0)
     first, second = answered(executor, asking, replies, "late", "second")
     assert "has not answered" in first and second == "second"
+
+
+def test_a_server_that_does_not_answer_is_named_once_and_in_the_diagnostics_until_it_answers(executor, monkeypatch):
+    asking, replies = participant(executor, Asking), created(executor, ArrivalNode, Serving).component.replies
+    warned = []
+    monkeypatch.setattr(asking, "get_logger", lambda: SimpleNamespace(warning=warned.append))
+    asking.component.plan_perch(REQUEST, 0)
+    until(executor, lambda: len(replies) == 1)
+    asking._check_requests()
+    assert not warned and not asking.host_diagnostics()
+    monkeypatch.setattr("perch_sim.ros.participant_node.WARN_AFTER", -1.0)
+    asking._check_requests(), asking._check_requests()
+    assert warned == ["no plan_perch from serving for -1 s"]
+    assert asking.host_diagnostics() == {"waiting_for": "plan_perch from serving"}
+    assert answered(executor, asking, replies, "late") == ["late"]
+    assert not asking.host_diagnostics()
+
+
+def test_a_vehicle_names_the_participants_that_do_not_connect(executor, monkeypatch):
+    vehicle = created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=["estimator", "controller"])
+    warned = []
+    monkeypatch.setattr(vehicle, "get_logger", lambda: SimpleNamespace(warning=warned.append))
+    vehicle._check_start(vehicle._created_at + 2.9)
+    assert not warned
+    for waited in (3.1, 4.0, 14.0):
+        vehicle._check_start(vehicle._created_at + waited)
+    assert warned == [f"lockstep: for {waited} s waiting for estimator, controller to connect" for waited in (3, 14)]
+
+
+def test_a_participant_without_a_vehicle_says_so(executor, monkeypatch):
+    monkeypatch.setattr("perch_sim.ros.participant_node.WARN_AFTER", -1.0)
+    warned = []
+    monkeypatch.setattr(Asking, "warn", lambda self, text, interval: warned.append(text))
+    created(executor, ParticipantNode, Asking)
+    assert warned == ["lockstep: no vehicle yet in namespace / for 0 s"]
 
 
 class Failing(Component[Nothing]):

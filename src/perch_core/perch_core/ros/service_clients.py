@@ -9,6 +9,7 @@ from typing import Any
 from perch_core.component import Client, Component, Unavailable, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
+from perch_core.ros.wiring import UNNAMED
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
@@ -34,10 +35,19 @@ def connect_clients(node: Node, component: Component[Any]) -> dict[Client[Any, A
     return functions
 
 
+def _server_infos(node: Node, service: str) -> list[Any]:
+    """Return the servers of a service: the publishers of its reply topic, under the middleware's name of the topic."""
+    return list(node.get_publishers_info_by_topic(f"rr{node.resolve_service_name(service)}Reply", no_mangle=True))
+
+
 def _servers(node: Node, client: Any) -> set[bytes]:
-    """Return the servers of a client: the publishers of its reply topic, under the middleware's name of the topic."""
-    replies = f"rr{node.resolve_service_name(client.srv_name)}Reply"
-    return {bytes(info.endpoint_gid) for info in node.get_publishers_info_by_topic(replies, no_mangle=True)}
+    return {bytes(info.endpoint_gid) for info in _server_infos(node, client.srv_name)}
+
+
+def server_names(node: Node, service: str) -> str:
+    """Return the names of the nodes that offer a service, as far as discovered."""
+    names = {info.node_name for info in _server_infos(node, service)} - {UNNAMED}
+    return ", ".join(sorted(names)) or "a node that is not visible"
 
 
 def _watch_servers(node: Node, component: Component[Any], client: Any) -> None:

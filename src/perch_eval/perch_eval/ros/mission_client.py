@@ -85,7 +85,6 @@ class MissionClient(GraphNode):
 
     Attributes:
         time: newest simulation time seen [s].
-        waiting_for: participants that the vehicle waits for, and for which message, from `/diagnostics`; empty: none.
         processes: node -> its process, from its newest diagnostics; changes when the node is restarted.
     """
 
@@ -97,7 +96,8 @@ class MissionClient(GraphNode):
         super().__init__("mission_client", in_namespace(namespace))
         self._client = ActionClient(self.node, Perch, "perch")
         self._vehicle = self.node.get_namespace().rstrip("/") + "/vehicle"
-        self.time, self.waiting_for, self._last_check = 0.0, "", 0.0
+        self.time, self._last_check = 0.0, 0.0
+        self._waits: dict[str, str] = {}  # node -> what it waits for, by its newest diagnostics
         self._last_clock = time.monotonic()  # when time advanced last [s]
         self._last_message: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
         self.processes: dict[str, str] = {}
@@ -107,8 +107,15 @@ class MissionClient(GraphNode):
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._receive_diagnostics,
                                        topics.topic("/diagnostics").qos.subscribe)
 
+    @property
+    def waiting_for(self) -> str:
+        """The participants and messages that the vehicle waits for, and the servers that other nodes wait for; empty: none."""
+        own = self._vehicle.removesuffix("vehicle")
+        others = [f"{name} for {text}" for name, text in sorted(self._waits.items()) if name.startswith(own) and name != self._vehicle and text]
+        return "; ".join(filter(None, [self._waits.get(self._vehicle, ""), *others]))
+
     def node_events(self) -> list[str]:
-        """Return messages on nodes that, since the last call, were restarted or became silent while others publish (hung, ended).
+        """Return messages on nodes that, since the last call, were restarted or became silent while others publish.
 
         Nodes of one process take turns: if one of them publishes, the others count as waiting, not silent.
         """
@@ -119,7 +126,8 @@ class MissionClient(GraphNode):
                 process = self.processes.get(name, name)
                 last_of_process[process] = max(received, last_of_process.get(process, 0.0))
             silent = {name for name in self._last_message if now - last_of_process[self.processes.get(name, name)] > SILENCE_TIMEOUT}
-            events += [f"{name} has sent no diagnostics for {SILENCE_TIMEOUT:g} s" for name in sorted(silent - self._silent)]
+            events += [f"{name} has sent no diagnostics for {SILENCE_TIMEOUT:g} s: it hangs or has ended, or the machine is overloaded"
+                       for name in sorted(silent - self._silent)]
             self._silent = silent
         return events
 
@@ -264,5 +272,4 @@ class MissionClient(GraphNode):
             if self.processes.setdefault(status.name, status.hardware_id) != status.hardware_id:
                 self.processes[status.name] = status.hardware_id
                 self._node_events.append(f"{status.name} was restarted")
-            if status.name == self._vehicle:
-                self.waiting_for = next((pair.value for pair in status.values if pair.key == "waiting_for"), "")
+            self._waits[status.name] = next((pair.value for pair in status.values if pair.key == "waiting_for"), "")

@@ -10,13 +10,14 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from perch_core.component import Action, Component, Input, Service, Unavailable, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
-from perch_core.ros.service_clients import Send, connect_clients
+from perch_core.ros.service_clients import Send, connect_clients, server_names
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import Intake
 from perch_core.ros.priority import priority
@@ -28,10 +29,23 @@ from rclpy.clock import Clock, ClockType
 
 CONNECT_PERIOD = 0.1   # between attempts to connect to the vehicle [s]
 CHECK_PERIOD = 0.005   # between checks whether an unfinished batch can continue [s]
+REQUEST_PERIOD = 0.5   # between checks of open requests [s]
 POLL_TIMEOUT = 0.01    # wait for a batch before other events are processed [s]
 ANSWER_TIMEOUT = 50.0  # an answer this late was lost with its server: more than a plan may take, less than `lockstep_timeout` [s]
+WARN_AFTER = 3.0       # a vehicle that is missing, or a server that has not answered, for so long is reported [s]
+WARN_REPEAT = 10.0     # between reports of a missing vehicle [s]
 BURST = 40             # batches between which other events are processed
 OBSERVED = ("/diagnostics", "/tf", "/tf_static", "robot_description")  # taken on arrival by components that only store messages
+
+
+@dataclass
+class _OpenRequest:
+    """A request without an answer: its service, when it was sent (monotonic clock) [s], and its server once it is overdue."""
+
+    channel: str
+    answer: Answer
+    since: float
+    overdue: str = ""
 
 
 class ParticipantNode(ComponentNode):
@@ -53,10 +67,10 @@ class ParticipantNode(ComponentNode):
         self.participant.inputs -= {port.channel(self.component) for port in self._observed}
         self._intake = Intake(self)
         self._request_senders: dict[str, Send] = {}
-        self._open_requests: list[tuple[str, Answer, float]] = []
-        """Requests without an answer: channel, answer, and time on the monotonic clock [s]."""
+        self._open_requests: list[_OpenRequest] = []
         self._busy = False  # processing a batch
         self._vehicle: Any = None  # the connection to it, if any
+        self._without_vehicle_since = time.monotonic()
         self._connection_poll = ConnectionPoll()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         wiring.participants[name] = self.participant
@@ -68,7 +82,7 @@ class ParticipantNode(ComponentNode):
         for observed in self._observed:
             self._intake.add(observed)
         if self._request_senders:
-            self.create_timer(1.0, self._expire_requests, clock=self._steady)
+            self.create_timer(REQUEST_PERIOD, self._check_requests, clock=self._steady)
         if self.wiring.hosts_schedule:
             return
         if is_slow(self.get_name()):
@@ -92,6 +106,8 @@ class ParticipantNode(ComponentNode):
             if self._vehicle is not None:
                 self._connection_poll.add(self._vehicle)
                 self.wiring.from_thread(self._process_batches)
+            elif (waited := time.monotonic() - self._without_vehicle_since) > WARN_AFTER:
+                self.component.warn(f"lockstep: no vehicle yet in namespace {self.get_namespace()} for {waited:.0f} s", WARN_REPEAT)
 
     def _process_batches(self) -> None:
         """Process up to `BURST` batches, then let the executor process other events first."""
@@ -142,7 +158,7 @@ class ParticipantNode(ComponentNode):
         """Close the connection to a vehicle that has ended; another one may be found later."""
         self._busy = False
         self._connection_poll.remove(self._vehicle)
-        self._vehicle = None
+        self._vehicle, self._without_vehicle_since = None, time.monotonic()
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
@@ -154,7 +170,7 @@ class ParticipantNode(ComponentNode):
     def _send_request(self, channel: str, request: Any) -> Answer:
         """Send a component's request to its service; the participant delivers the answer when it is due."""
         answer = Answer()
-        self._open_requests.append((channel, answer, time.monotonic()))
+        self._open_requests.append(_OpenRequest(channel, answer, time.monotonic()))
         self._request_senders[channel](request, partial(self._take_answer, answer))
         return answer
 
@@ -162,13 +178,22 @@ class ParticipantNode(ComponentNode):
         answer(value)
         self._progress()
 
-    def _expire_requests(self) -> None:
-        """Answer overdue requests with `Unavailable`: their servers may have ended, and the flight must not wait for ever."""
-        self._open_requests = [request for request in self._open_requests if not request[1].done()]
-        for channel, answer, since in self._open_requests:
-            if time.monotonic() - since > ANSWER_TIMEOUT:
+    def _check_requests(self) -> None:
+        """Name servers that do not answer. In the end answer for them with `Unavailable`: the flight must not wait for ever."""
+        self._open_requests = [request for request in self._open_requests if not request.answer.done()]
+        for request in self._open_requests:
+            channel, waited = request.channel, time.monotonic() - request.since
+            if waited > WARN_AFTER and not request.overdue:
+                request.overdue = f"{channel} from {server_names(self, channel)}"
+                self.get_logger().warning(f"no {request.overdue} for {WARN_AFTER:g} s")
+            if waited > ANSWER_TIMEOUT:
                 self.get_logger().error(f"{channel} has not answered for {ANSWER_TIMEOUT:g} s: the request is dropped")
-                self._take_answer(answer, Unavailable(f"{channel} has not answered within {ANSWER_TIMEOUT:g} s"))
+                self._take_answer(request.answer, Unavailable(f"{channel} has not answered within {ANSWER_TIMEOUT:g} s"))
+
+    def host_diagnostics(self) -> dict[str, Any]:
+        """Return the overdue answers, and the servers that owe them."""
+        overdue = [request.overdue for request in self._open_requests if request.overdue and not request.answer.done()]
+        return {"waiting_for": ", ".join(overdue)} if overdue else {}
 
     def _progress(self) -> None:
         """Continue the present batch, as something for which it waits may have arrived."""

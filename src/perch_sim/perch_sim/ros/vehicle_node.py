@@ -208,7 +208,10 @@ class VehicleNode(ComponentNode):
                 self._schedule.join(one)
             self._started, self._last_progress = True, now
             self.get_logger().info(f"lockstep: starting with {', '.join(self._schedule.names) or 'no participants'}")
-        elif missing and now - self._created_at > (timeout := max(START_TIMEOUT, self.component.config.lockstep_timeout)):
+            return
+        if not complete:
+            self._warn_of_wait(now, self._created_at)
+        if missing and now - self._created_at > (timeout := max(START_TIMEOUT, self.component.config.lockstep_timeout)):
             for name in missing:
                 self._dropped.add(name)
                 self.get_logger().error(f"lockstep: {name} has not connected within {timeout:g} s: dropped")
@@ -218,15 +221,20 @@ class VehicleNode(ComponentNode):
         if silence < WARN_AFTER:
             return
         pending = self._schedule.pending()
-        if pending and (self._last_warning < self._last_progress or now - self._last_warning > WARN_REPEAT):
-            self._last_warning = now
-            self.get_logger().warning(f"lockstep: for {silence:.0f} s waiting for {self._describe_wait()}")
+        if pending:
+            self._warn_of_wait(now, self._last_progress)
         for name in [one.name for one in pending if one.name in self._remote]:
             if name not in self._disconnected and self._schedule.now < START_DEADLINE:
                 continue  # it may wait for a goal, and its planners may still compile
             if silence > self.component.config.lockstep_timeout:  # a node that has ended may be restarted meanwhile
                 self._drop(name, "disconnected" if name in self._disconnected else f"silent for {silence:.0f} s")
                 self._last_progress = now
+
+    def _warn_of_wait(self, now: float, since: float) -> None:
+        """Log what the flight has waited for since a time [s], after `WARN_AFTER` and at intervals of `WARN_REPEAT`."""
+        if now - since >= WARN_AFTER and (self._last_warning <= since or now - self._last_warning > WARN_REPEAT):
+            self._last_warning = now
+            self.get_logger().warning(f"lockstep: for {now - since:.0f} s waiting for {self._describe_wait()}")
 
     def _drop(self, name: str, why: str) -> None:
         self.get_logger().error(f"lockstep: {name} is {why}: dropped, the flight continues without it")

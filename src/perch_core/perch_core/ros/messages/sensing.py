@@ -63,7 +63,7 @@ def compressed_value(msg: CompressedImage) -> CameraImage:
         if reason := LIMITS[CameraImage][name].problem(n):
             raise PerchError(f"compressed image: {name}: {reason}")
     try:
-        pixels = cv2.imdecode(np.frombuffer(msg.data, np.uint8), cv2.IMREAD_UNCHANGED) if len(msg.data) else None
+        pixels = cv2.imdecode(np.frombuffer(msg.data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:  # more pixels than OpenCV decodes
         pixels = None
     if pixels is None or pixels.dtype != np.uint8 or (pixels.ndim == 3 and pixels.shape[2] != 3):
