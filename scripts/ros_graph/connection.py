@@ -17,8 +17,8 @@ from perch_eval.ros.graph_node import GraphNode
 from ros_graph.commands import GraphError, NoAnswerError, is_absolute_name
 
 T = TypeVar("T")
-_SETTLED_S = 0.7
-"""Discovery counts as finished when nothing new has appeared for this time [s]."""
+_SETTLED_S = 1.0
+"""Discovery counts as finished when nothing in the whole graph has changed for this time [s]."""
 
 
 class GraphConnection(GraphNode):
@@ -38,19 +38,25 @@ class GraphConnection(GraphNode):
         return future.result()
 
     def settle(self, observe: Callable[[], T], timeout: float) -> T:
-        """Return an observation of the graph once it has settled, at the latest after `timeout` [s]."""
-        observed, since = observe(), time.monotonic()
+        """Return an observation of the graph once the whole graph has settled, at the latest after `timeout` [s].
+
+        What is observed may lack endpoints while it does not change: on a busy machine nodes are discovered one by one.
+        """
+        def everything() -> tuple[T, object, object]:
+            return observe(), self.nodes(), self.node.get_topic_names_and_types(no_demangle=True)
+
+        last, since = everything(), time.monotonic()
         end = since + timeout
 
         def settled() -> bool:
-            nonlocal observed, since
-            now = observe()
-            if now != observed:
-                observed, since = now, time.monotonic()
+            nonlocal last, since
+            now = everything()
+            if now != last:
+                last, since = now, time.monotonic()
             return time.monotonic() - since > _SETTLED_S or time.monotonic() > end
 
         self.spin_until(settled)
-        return observed
+        return last[0]
 
     def absolute(self, name: str) -> str:
         """Return a name as an absolute one.
