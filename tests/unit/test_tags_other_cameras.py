@@ -114,6 +114,20 @@ def test_a_grid_whose_tags_touch_black_squares(distance, least):
     assert len(result.board.ids) >= least and position < 0.003 and np.degrees(attitude) < 0.3
 
 
+@pytest.mark.parametrize("blur", [0.6, 1.5, 2.0, 2.5])
+def test_large_tags_of_a_blurred_grid_are_not_found_at_the_inner_outline_of_their_borders(blur):
+    """Tags 170 px wide whose corner squares merge with them: corners found to 3 px, and all measured to 0.5 px."""
+    rng = np.random.default_rng(5)
+    board = TagBoard((0.4, 0.4), border=2, corner_squares=True, grid=TagGrid(2, 2, 0.16, 0.3, rotation=180.0))
+    p, R = np.array([0.0, 0.0, 0.45]), turned(4.0, -3.0, 5.0)
+    image = photographed([(board, p, R)], rng, blur)
+    found = TagDetector(board, CAMERA).search(image)
+    truth = CAMERA.project(board.corners_S @ R.T + p)[0]
+    assert found.ids == board.ids and np.abs(found.corners - truth).max() < 3.0
+    refined = refine_corners(image, CAMERA, found.corners, modules=board.modules)
+    assert refined.measured.all() and np.abs(CAMERA.project(refined.rays_C)[0] - truth).max() < 0.5
+
+
 def test_of_two_boards_alike_the_expected_one_is_followed_and_a_stray_tag_is_left_out(monkeypatch):
     monkeypatch.setattr("perch_perception.tags.localizer.MAX_TRACKED_IMAGES", 0)
     rng, board, alone = np.random.default_rng(4), pad(), TagBoard((0.2, 0.2), (Tag(2, (0.0, 0.0), 0.16),))

@@ -47,20 +47,26 @@ class TagDetector:
         self._view = _detector(board, VIEW_WINDOW, least=VIEW_MIN_PERIMETER)
 
     def search(self, image: np.ndarray, turn: int | None = None) -> Detection:
-        """Detect tags in the whole frame, enlarged twice.
+        """Detect tags in the whole frame, enlarged twice; on a board with corner squares also in the frame as it is.
+
+        There `CUT` separates blurred squares that are larger: otherwise only the inner outline of a tag's border is found.
 
         Args:
             image: mono8, shape (height, width).
             turn: number of this search: successive searches begin with different threshold windows, and end with the first window
                 that shows a tag of the board. None: all windows are used.
         """
-        large, found = cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), []
+        frames = [(2.0, cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC))]
+        if self.board.corner_squares:
+            frames.append((1.0, image))
+        found = list[tuple[np.ndarray, np.ndarray]]()
         for k in range(len(self._search)):
-            found.append(self._detect(self._search[(k + (turn or 0)) % len(self._search)], large))
-            if turn is not None and np.isin(found[-1][1], self.board.ids).any():
+            for scale, frame in frames:
+                corners, ids = self._detect(self._search[(k + (turn or 0)) % len(self._search)], frame)
+                found.append(((corners - 0.5 * (scale - 1.0)) / scale, ids))  # cv2.resize maps the centre u of a pixel to 2 u + 0.5
+            if turn is not None and any(np.isin(ids, self.board.ids).any() for _, ids in found):
                 break
-        # cv2.resize maps the centre u of a pixel to 2 u + 0.5
-        return self._select([((corners - 0.5) / 2.0, ids) for corners, ids in found])
+        return self._select(found)
 
     def detect_in_view(self, image: np.ndarray, view: VirtualView, origin: tuple[int, int] = (0, 0)) -> Detection:
         """Detect tags in a virtual view of the image (mono8), or of the part of it that begins at `origin` (column, row).
@@ -83,10 +89,16 @@ class TagDetector:
         return corners, np.zeros(0, int) if ids is None else np.ravel(ids)
 
     def _select(self, found: list[tuple[np.ndarray, np.ndarray]]) -> Detection:
-        """Keep markers of the board that lie wholly inside the image; a marker found by several detectors counts once."""
+        """Keep markers of the board that lie wholly inside the image; a marker found by several detectors counts once.
+
+        On a board with corner squares its largest outline counts: a smaller one is the inner outline of its border.
+        """
         rejected, kept = list[str](), list[tuple[int, np.ndarray]]()
-        for corners, number in ((c, int(n)) for places, ids in found for c, n in zip(places, ids)):
-            side = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean()
+        sightings = [(c, int(n)) for places, ids in found for c, n in zip(places, ids)]
+        if self.board.corner_squares:
+            sightings.sort(key=lambda sighting: -_side(sighting[0]))
+        for corners, number in sightings:
+            side = _side(corners)
             if number not in self.board.ids:
                 rejected.append(f"tag {number} does not belong to the board")
             elif not np.all(self.camera.contains(corners, margin=1.0)):
@@ -97,6 +109,11 @@ class TagDetector:
                 kept.append((number, corners))
         kept.sort(key=lambda entry: entry[0])
         return Detection(tuple(n for n, _ in kept), np.array([c for _, c in kept]).reshape(-1, 4, 2), tuple(sorted(set(rejected))))
+
+
+def _side(corners: np.ndarray) -> float:
+    """Return the mean side of a tag [px] with corners (4, 2)."""
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
 
 
 def _detector(board: TagBoard, window: int, darker: float = 7.0, least: float = 0.03) -> cv2.aruco.ArucoDetector:
