@@ -1,6 +1,7 @@
 """Flights that were recorded: figures, animation, plots and report of a file are those of the values that were flown; refusals."""
 
 import base64
+import html
 import io
 import json
 import math
@@ -20,7 +21,7 @@ from perch_core.urdf import urdf
 from perch_core.values import (
     AtEnd, TrajectoryOrder)
 from perch_core.vehicle import load_vehicle
-from perch_eval import comparison, report
+from perch_eval import comparison, plots, report
 from perch_eval.camera_clip import clip
 from perch_eval.flight import Flight, timed
 from perch_eval.flight_view import FlightView
@@ -31,6 +32,7 @@ from perch_eval.replay import animation, command
 from perch_eval.replay.command import main
 from perch_eval.replay.stroboscope import stroboscope
 from perch_eval.ros.recorded_flight import RecordedFlight
+from perch_eval.scene_3d import scene_3d
 
 
 def test_a_recording_is_the_flight_that_was_flown(recorded):
@@ -106,7 +108,19 @@ def test_a_report_is_written(recorded, reported):
     reported_at = datetime.strptime(written["date"], "%Y-%m-%d %H:%M UTC").replace(tzinfo=UTC)
     assert abs(datetime.now(UTC) - reported_at) < timedelta(hours=1)
     assert written["real_time_factor"] == pytest.approx(1.5)
+    assert f"<th>made by</th><td>{html.escape(written['command'])} on {written['machine']}</td>" in page and "cores, Python 3" in written["machine"]
     assert "1.50: 3.00 s of simulated time in 2.00 s" in page
+
+
+def test_everything_on_the_page_of_a_flight_ends_with_it(recorded):
+    flight = RecordedFlight(recorded[0])
+    view = FlightView.from_flight(flight, load_vehicle("snapdragon"), until=3.5)
+    assert view.around(0.5, 1.0) == (1.0, 3.5)
+    shown = json.loads(re.search(r'<script type="application/json">(.*?)</script>', scene_3d([view]))[1])["flights"][0]
+    assert shown["t"][-1] == 3.5
+    for figure in (plots.error_figure(view), plots.tracking_figure(view), plots.rates_figure(view)):
+        assert figure.axes[0].get_xlim()[1] == 3.5
+    assert "front camera, 1.00 to 3.40 s" in clip(flight, 3.5)
 
 
 def test_a_replanned_trajectory_is_distinct_from_one_that_starts():

@@ -30,3 +30,8 @@ def test_durations_are_medians_in_milliseconds_whatever_their_unit():
 def test_the_last_diagnostics_leave_durations_to_the_other_table():
     flown = flight(("vio", {"tracks": 10, "step_us_p99": 12.5}), ("vio", {"tracks": 40, "step_us_p99": 12.5, "image_ms": 3.0, "clock_offset_s": 0.25}))
     assert last_diagnostics(flown) == [("vio", "tracks 40, clock offset 0.25 s")]
+
+
+def test_the_last_diagnostics_have_whole_numbers_and_no_second_real_time_factor_and_no_empty_rows():
+    flown = flight(("vehicle", {"time_s": 6.874, "steps": 14210, "real_time_factor": 0.6775, "steps_per_s": 257.252}), ("mission", {"step_us_p99": 577.8}))
+    assert last_diagnostics(flown) == [("vehicle", "steps 14210, steps 257.3 per s")]

@@ -19,14 +19,14 @@ BEFORE, AFTER, MAX_DURATION = 1.0, 1.0, 10.0  # shown around the perch, and at t
 PAUSE = 1.0   # on the last frame [s]
 
 
-def clip(flight: Flight) -> str:
-    """Return the animation, at the speed of the flight, as HTML; empty if no image was recorded in the time shown."""
+def clip(flight: Flight, until: float = np.inf) -> str:
+    """Return the animation up to a time [s], at the speed of the flight, as HTML; empty if no image was recorded in the time shown."""
     recorded = {name: found for name in CAMERAS if (found := flight.values(f"camera_{name}/image_raw/compressed"))}
     if not recorded:
         return ""
-    last = max(images[-1][0] for images in recorded.values())
+    last = min(until, max(images[-1][0] for images in recorded.values()))
     window = perch_window(flight)
-    start, end = (window[0] - BEFORE, window[1] + AFTER) if window else (last - MAX_DURATION, last)
+    start, end = (window[0] - BEFORE, min(until, window[1] + AFTER)) if window else (last - MAX_DURATION, last)
     times = [t for t, _ in next(iter(recorded.values())) if start <= t <= end]
     if not times:
         return ""

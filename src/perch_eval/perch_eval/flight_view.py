@@ -30,6 +30,7 @@ class FlightView:
         cables: end points of mapped wires, (n, 2, 3).
         camera: (time [s], image) of the front camera's images.
         start, end: of the perch, or of the recording where there is none [s].
+        until: end of what is shown [s].
     """
 
     name: str
@@ -44,10 +45,11 @@ class FlightView:
     camera: list[tuple[float, CameraImage]]
     start: float
     end: float
+    until: float
 
     @classmethod
-    def from_flight(cls, flight: Flight, vehicle: Vehicle, name: str = "", colour: str = TRUTH) -> FlightView:
-        """Collect the data of a recording.
+    def from_flight(cls, flight: Flight, vehicle: Vehicle, name: str = "", colour: str = TRUTH, until: float = np.inf) -> FlightView:
+        """Collect the data of a recording, to be shown up to a time [s].
 
         Raises:
             PerchError: the recording has no true states.
@@ -57,13 +59,14 @@ class FlightView:
             pad = np.array(targets[-1][1].p), so3.quat_to_matrix(np.array(targets[-1][1].q))
         lines = flight.values("powerlines")
         cables = np.array([[line.start, line.end] for line in lines[-1][1].lines]) if lines else np.zeros((0, 2, 3))
-        window = perch_window(flight) or (float(truth.t[0]), float(truth.t[-1]))
+        last = max(float(truth.t[0]), min(float(truth.t[-1]), until))
+        window = perch_window(flight) or (float(truth.t[0]), last)
         return cls(name, colour, flight, vehicle, truth, flight.states("odometry"), flight.reference(), pad, cables.reshape(-1, 2, 3),
-                   flight.values("camera_front/image_raw/compressed"), *window)
+                   flight.values("camera_front/image_raw/compressed"), *window, last)
 
     def around(self, before: float, after: float) -> tuple[float, float]:
-        """Return the time span of the perch with margins before and after it, as far as it is recorded [s]."""
-        return max(float(self.truth.t[0]), self.start - before), min(float(self.truth.t[-1]), self.end + after)
+        """Return the time span of the perch with margins before and after it, as far as it is recorded and shown [s]."""
+        return max(float(self.truth.t[0]), self.start - before), min(self.until, self.end + after)
 
     @property
     def pad_corners(self) -> np.ndarray | None:

@@ -49,7 +49,7 @@ def panels(views: Views, content: Sequence[Panel], columns: int, height: float =
     """
     alone, rows = len(views) == 1, -(-len(content) // columns)
     low, high = span or (min(view.start - _time_offset(views, view) for view in views) - BEFORE,
-                         max(view.end - _time_offset(views, view) for view in views) + AFTER)
+                         max(min(view.end + AFTER, view.until) - _time_offset(views, view) for view in views))
     figure = Figure(figsize=(12, height * rows), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for axis, (label, lines) in zip(grid.flat, content):
@@ -63,6 +63,8 @@ def panels(views: Views, content: Sequence[Panel], columns: int, height: float =
                 axis.axvline(time, color=colour, lw=0.8, ls=style, label=name or None)
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
+    if low < high:
+        grid[0, 0].set_xlim(low, high)
     if grid[0, 0].get_legend_handles_labels()[1]:
         grid[0, 0].legend(fontsize=8)
     for axis in grid[-1]:
@@ -142,7 +144,7 @@ def error_figure(view: FlightView) -> Figure | None:
     return panels([view], [(f"error {name}, 3 sigma [cm]", [
         Line(estimate.t, 100 * error[:, i], TRUTH, "estimate - truth", width=1.0),
         *(Line(t, sign * 300 * sigma[:, i], LIMIT, label, "--", 0.7) for sign, label in ((-1, "3 sigma"), (1, "")))]) for i, name in enumerate("xyz")], 3, 2.8,
-        span=(float(began), float(estimate.t[-1])))
+        span=(float(began), min(float(estimate.t[-1]), view.until)))
 
 
 def distance_figure(*views: FlightView) -> Figure:

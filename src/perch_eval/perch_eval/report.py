@@ -16,6 +16,7 @@ from perch_core.json_values import to_text
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
 from perch_eval.camera_clip import clip
+from perch_eval.evaluation.document import machine
 from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
 from perch_eval.identification.responses import inner_loop_figure
@@ -25,7 +26,7 @@ from perch_eval.margins import margin_text, margins
 from perch_eval.metrics import DURATION, diagnostics, flight_metrics, missed_deadlines, node_durations, rates
 from perch_eval.goal import SUCCESSES
 from perch_eval.page import Html, image, page, section, table, text
-from perch_eval.revision import code_version
+from perch_eval.revision import code_version, command_line
 from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.scene_3d import scene_3d
 from perch_sim.scenario import Scenario
@@ -55,7 +56,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         start_time = first[0][0] if first else end_time
     report: dict[str, Any] = {
         "outcome": outcome, "message": message, "scenario": scenario.name, "vehicle": scenario.vehicle, "seed": seed,
-        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", **code_version(),
+        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", **code_version(), "command": command_line(), "machine": machine(),
         "simulated_time_s": end_time, "simulated_duration_s": end_time - start_time, "wall_time_s": wall_time,
         "real_time_factor": (end_time - start_time) / wall_time if wall_time > 0 else math.nan,
         **flight_metrics(flight, end_time),
@@ -81,6 +82,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
 
 
 UNITS = {"per_s": "per s", "s": "s", "hz": "Hz", "deg": "deg", "percent": "%"}  # in names of diagnostics
+WHOLE_FLIGHT = ("time_s", "real_time_factor")  # diagnostics that the report has elsewhere
 _UNIT = re.compile(rf"_({'|'.join(UNITS)})(?=_|$)")
 
 
@@ -106,15 +108,17 @@ def _timeline(flight: Flight) -> list[tuple[float, str]]:
 
 
 def last_diagnostics(flight: Flight) -> list[tuple[str, str]]:
-    """Return the last diagnostics of each node in words, without durations, which `node_durations` has for the whole flight."""
-    return [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items() if not DURATION.search(k)))
+    """Return the last diagnostics of each node in words, without what the page has for the whole flight: durations, the vehicle's time
+    and its real-time factor. Nodes that report nothing else are left out."""
+    rows = [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items() if k not in WHOLE_FLIGHT and not DURATION.search(k)))
             for node, reports in diagnostics(flight).items()]
+    return [(node, words) for node, words in rows if words]
 
 
 def _with_unit(key: str, value: float) -> str:
     """Return a diagnostics value in words, with the unit that is part of its name."""
-    unit = _UNIT.search(key)
-    return f"{_UNIT.sub('', key).replace('_', ' ')} {value:.4g}{f' {UNITS[unit[1]]}' if unit else ''}"
+    unit, whole = _UNIT.search(key), float(value).is_integer()
+    return f"{_UNIT.sub('', key).replace('_', ' ')} {f'{value:.0f}' if whole else f'{value:.4g}'}{f' {UNITS[unit[1]]}' if unit else ''}"
 
 
 def _centimetres(values: Any) -> str:
@@ -169,18 +173,19 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
     title = f"{scenario.name}, seed {report['seed']}"
     view = None
     with suppress(PerchError):
-        view = FlightView.from_flight(flight, vehicle, scenario.name)
+        view = FlightView.from_flight(flight, vehicle, scenario.name, until=report["simulated_time_s"])
     good = "good" if report["outcome"] in SUCCESSES else "bad"
     timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
                for node, values in report["timings_ms"].items()]
     margin_rows = [(m["name"], margin_text(m)) for m in report["margins"]]
     flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("seed", report["seed"]), ("date", report["date"]),
-             ("commit", report["commit"] + (f" (digest {report['digest']})" if report["digest"] else ""))]
+             ("commit", report["commit"] + (f" (digest {report['digest']})" if report["digest"] else "")),
+             ("made by", f"{report['command']} on {report['machine']}")]
     return page(
         title, table([*flown, *summary(report)]), section("Margins", table(margin_rows), "No perch was planned."),
         section("Timeline", table((f"{t:.3f} s", event) for t, event in _timeline(flight))),
         section("Flight in 3-D", scene_3d([view]) if view is not None else "", "not recorded"),
-        section("Camera images", clip(flight), "No images were recorded."),
+        section("Camera images", clip(flight, report["simulated_time_s"]), "No images were recorded."),
         *(section(name, image(figure, name)) for name, figure in _figures(view, inspection)),
         section("Rates", table((topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())),
         section("Times that the nodes measured", table(timings)), section("Diagnostics of the last second", table(last_diagnostics(flight))),

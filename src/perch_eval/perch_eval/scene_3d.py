@@ -15,7 +15,7 @@ import numpy as np
 from perch_eval.flight_view import FlightView
 
 PERIOD = 0.02     # between instants that are shown [s]
-BEFORE, AFTER = 1.5, 1.0  # shown around a perch [s]
+BEFORE, AFTER = 1.5, 1.0  # shown around a perch; a flight alone is shown to its end [s]
 
 
 def scene_3d(views: Sequence[FlightView]) -> str:
@@ -25,7 +25,8 @@ def scene_3d(views: Sequence[FlightView]) -> str:
         views: flights to show; with several, the time of each is relative to the start of its perch.
     """
     legend = "".join(f'<span style="color:{view.colour}">&#9632;</span> {html.escape(view.name)} &nbsp; ' for view in views)
-    flights = [_flight(view, 0.0 if len(views) == 1 else view.start) for view in views]
+    alone = len(views) == 1
+    flights = [_flight(view, 0.0 if alone else view.start, np.inf if alone else AFTER) for view in views]
     data = json.dumps({"flights": flights}, separators=(",", ":")).replace("</", "<\\/")
     return ('<div><canvas width="1100" height="620" style="width:100%;touch-action:none;cursor:grab;background:#fafafa"></canvas>'
             '<div><button type="button">play</button> <input type="range" min="0" max="1000" value="1000" style="width:70%" '
@@ -34,9 +35,9 @@ def scene_3d(views: Sequence[FlightView]) -> str:
             f'<script type="application/json">{data}</script><script>{_SCRIPT}</script></div>')
 
 
-def _flight(view: FlightView, zero: float) -> dict[str, Any]:
-    start, end = view.around(BEFORE, AFTER)
-    times = np.arange(start, end + 0.5 * PERIOD, PERIOD)
+def _flight(view: FlightView, zero: float, after: float) -> dict[str, Any]:
+    start, end = view.around(BEFORE, after)
+    times = np.linspace(start, end, 1 + round((end - start) / PERIOD))
     states, reference = view.truth.at(times), view.reference
     reference_path = np.empty((0, 3)) if reference is None else reference.p[(reference.t >= start) & (reference.t <= end)][::2]
     return {"colour": view.colour, "t": _rounded(times - zero), "p": _rounded(states.p), "q": _rounded(states.q, 4),
@@ -56,8 +57,10 @@ _SCRIPT = """
   const every = flights.flatMap(f => [...f.p, ...f.pad]);
   const low = [0, 1, 2].map(k => Math.min(...every.map(p => p[k]))), high = [0, 1, 2].map(k => Math.max(...every.map(p => p[k])));
   const begin = Math.min(...flights.map(f => f.t[0])), end = Math.max(...flights.map(f => f.t[f.t.length - 1]));
+  const a = low.map(v => Math.floor(v - 0.5)), b = high.map(v => Math.ceil(v + 0.5)), origin = [a[0], a[1], 0];  // of floor and axes
+  const ends = [0, 1, 2].map(n => origin.map((v, k) => v + (k === n)));
   const centre = low.map((v, k) => (v + high[k]) / 2);
-  let scale = 0.8 * Math.min(canvas.width, canvas.height) / Math.max(1, ...low.map((v, k) => high[k] - v));
+  let scale = 1;
   let az = -1.2, el = 0.3, now = end, playing = false, right, up, towards;
   const axes = () => {
     const [ca, sa, ce, se] = [Math.cos(az), Math.sin(az), Math.cos(el), Math.sin(el)];
@@ -67,6 +70,15 @@ _SCRIPT = """
   const project = p => {
     const d = p.map((v, k) => v - centre[k]);
     return [canvas.width / 2 + scale * dot(d, right), canvas.height / 2 - scale * dot(d, up), dot(d, towards)];
+  };
+  const fit = () => {  // flights, pads and axes fill 0.85 of the canvas: room for a rotor and the names of the axes
+    axes();
+    const shown = [...every, origin, ...ends].map(project);
+    const [left, top] = [0, 1].map(k => Math.min(...shown.map(p => p[k])));
+    const [wide, tall] = [Math.max(...shown.map(p => p[0])) - left, Math.max(...shown.map(p => p[1])) - top];
+    const [dx, dy] = [left + wide / 2 - canvas.width / 2, top + tall / 2 - canvas.height / 2];
+    for (let k = 0; k < 3; k++) centre[k] += dx * right[k] - dy * up[k];
+    scale = 0.85 * Math.min(canvas.width / wide, canvas.height / tall);
   };
   const turn = ([x, y, z, w], v) => {  // by a quaternion xyzw
     const t = [2 * (y * v[2] - z * v[1]), 2 * (z * v[0] - x * v[2]), 2 * (x * v[1] - y * v[0])];
@@ -80,13 +92,11 @@ _SCRIPT = """
   };
   const line = (points, style) => { for (let k = 1; k < points.length; k++) add([points[k - 1], points[k]], style); };
   const floor = () => {
-    const a = low.map(v => Math.floor(v - 0.5)), b = high.map(v => Math.ceil(v + 0.5));
     const style = {stroke: '#ddd', width: 1, lift: -100};
     for (let x = a[0]; x <= b[0]; x++) add([[x, a[1], 0], [x, b[1], 0]], style);
     for (let y = a[1]; y <= b[1]; y++) add([[a[0], y, 0], [b[0], y, 0]], style);
-    const o = [a[0], a[1], 0];
-    [['x', [1, 0, 0], '#c33'], ['y', [0, 1, 0], '#393'], ['z', [0, 0, 1], '#36c']].forEach(([name, d, stroke]) =>
-      add([o, o.map((v, k) => v + d[k])], {stroke, width: 2, text: name + ', 1 m'}));
+    [['x', '#c33'], ['y', '#393'], ['z', '#36c']].forEach(([name, stroke], n) =>
+      add([origin, ends[n]], {stroke, width: 2, text: name + ', 1 m'}));
   };
   const vehicle = (f, k) => {
     const q = f.q[k], at = v => turn(q, v).map((c, i) => c + f.p[k][i]);
@@ -147,6 +157,6 @@ _SCRIPT = """
     playing = true; button.textContent = 'pause';
     requestAnimationFrame(t => { last = t; step(t); });
   };
-  draw();
+  fit(); draw();
 })();
 """
