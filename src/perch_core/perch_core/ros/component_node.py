@@ -287,7 +287,11 @@ class ComponentNode(Node):
     def _publish_heartbeat(self) -> None:
         """Repeat the last diagnostics while the component emits none, so that an idle node differs from one that hangs."""
         if time.monotonic() - self._last_report_time >= HEARTBEAT_PERIOD:
-            self._publish_diagnostics(replace(self._last_report, stamp=self.host_time()))
+            self.repeat_diagnostics()
+
+    def repeat_diagnostics(self) -> None:
+        """Publish the component's last diagnostics again, with the host's present values."""
+        self._publish_diagnostics(replace(self._last_report, stamp=self.host_time()))
 
     def _publish_diagnostics(self, diagnostics: Diagnostics) -> None:
         self._last_report_time, self._last_report = time.monotonic(), diagnostics

@@ -186,6 +186,7 @@ class ParticipantNode(ComponentNode):
             if waited > WARN_AFTER and not request.overdue:
                 request.overdue = f"{channel} from {server_names(self, channel)}"
                 self.get_logger().warning(f"no {request.overdue} for {WARN_AFTER:g} s")
+                self.repeat_diagnostics()
             if waited > ANSWER_TIMEOUT:
                 self.get_logger().error(f"{channel} has not answered for {ANSWER_TIMEOUT:g} s: the request is dropped")
                 self._take_answer(request.answer, Unavailable(f"{channel} has not answered within {ANSWER_TIMEOUT:g} s"))
