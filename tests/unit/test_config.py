@@ -125,3 +125,11 @@ def test_unknown_name_lists_the_names_there_are():
 def test_replace_checks_ranges():
     with pytest.raises(ConfigError):
         config.replace(Outer(name="a"), count=100)
+
+
+@pytest.mark.parametrize("key, names, words", [
+    ("foo", [f"speed_{k}" for k in "abcdefghijklmnopqrst"], "unknown setting; allowed: speed_a, speed_b, speed_c, speed_d,"),
+    ("speed_ab", [f"speed_{k}" for k in "abcdefghijklmnopqrst"], "unknown setting; did you mean speed_b"),
+    ("foo", [f"{group}.gain_{k}" for group in ("rate", "tilt") for k in range(10)], "unknown setting; the 20 names begin with rate, tilt")])
+def test_an_unknown_name_comes_with_those_allowed_or_near_or_their_groups(key, names, words):
+    assert words in str(config.unknown("x.yaml", key, "setting", names))

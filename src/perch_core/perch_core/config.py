@@ -143,12 +143,14 @@ def _convert(kind: Any, value: Any, source: str, key: str) -> Any:
 
 
 def unknown(source: str, key: str, kind: str, names: Iterable[str]) -> ConfigError:
-    """Return the error for an unknown name; it lists the valid names, or the closest matches where there are many."""
+    """Return the error for an unknown name; it lists the valid names, or where there are many the closest matches or their groups."""
     names = list(names)
     close = difflib.get_close_matches(key, names, n=5, cutoff=0.4)
-    if len(names) <= 16:
-        return ConfigError(source, key, f"unknown {kind}; allowed: {', '.join(names)}")
-    hint = f"did you mean {', '.join(close)}?" if close else f"the {len(names)} names begin with {', '.join(dict.fromkeys(n.split('.')[0] for n in names))}"
+    groups = list(dict.fromkeys(name.split(".")[0] for name in names))
+    if len(names) <= 16 or not close and len(groups) == len(names):
+        hint = f"allowed: {', '.join(names)}"
+    else:
+        hint = f"did you mean {', '.join(close)}?" if close else f"the {len(names)} names begin with {', '.join(groups)}"
     return ConfigError(source, key, f"unknown {kind}; {hint}")
 
 
