@@ -14,6 +14,7 @@ from perch_core.vehicle import load_vehicle
 from perch_eval import comparison, plots
 from perch_eval.flight_view import FlightView
 from perch_eval.margins import margin_text, limits, margins
+from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_sim.scenario import load_scenario
 
 
@@ -132,3 +133,10 @@ def test_what_cannot_be_compared_is_one_line(content, words, recorded, tmp_path,
     said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
     assert len(said) == 1 and said[0].startswith("error: ") and words in said[0]
     assert not (tmp_path / "page.html").exists()
+
+
+def test_the_hash_of_a_flight_is_computed_once(recorded, monkeypatch):
+    computed, digest = [], RecordedFlight.digest
+    monkeypatch.setattr(RecordedFlight, "digest", lambda self, until: computed.append(until) or digest(self, until))
+    side = comparison.read("one", "k", recorded[0])
+    assert side.digest(side.until) == recorded[1].digest(side.until) and computed == [side.until]

@@ -41,6 +41,10 @@ class Side:
     report: dict[str, Any]
     known: bool
 
+    def digest(self, until: float) -> str:
+        """Return the flight's hash up to a time [s]; that up to its end is known."""
+        return self.report["flight_hash"] if until == self.until else self.flight.digest(until)
+
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
@@ -81,15 +85,15 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
     Raises:
         PerchError: there is no recording or no true states in it, or report or vehicle cannot be used.
     """
-    file = path / "flight.mcap" if path.is_dir() else path
-    flight = read_flight(file, namespace)
+    flight = read_flight(path, namespace)
     flight.known_states("ground_truth/odometry")
     report = read_report(flight)
     identified = identify_vehicle(flight, report, vehicle)
     model = identified or load_vehicle("snapdragon")
     view = FlightView.from_flight(flight, model, name, colour)
     until = report.get("simulated_time_s") or float(view.truth.t[-1])
-    report = {**report, **flight_metrics(flight, until), "flight_hash": report.get("flight_hash") or flight.digest(until)}
+    flight_hash = report["flight_hash"] if report.get("simulated_time_s") else flight.digest(until)
+    report = {**report, **flight_metrics(flight, until), "flight_hash": flight_hash}
     found = {one["name"]: one for one in report.get("margins", ()) if one.get("left") is not None}
     found |= {one.name: one.mapping() for one in margins(flight, model) if identified is not None}
     return Side(flight, until, view, report | {"margins": list(found.values())}, identified is not None)
@@ -99,7 +103,7 @@ def compare(a: Side, b: Side) -> str:
     """Return the page as HTML."""
     sides, views = (a, b), (a.view, b.view)
     until = min(a.until, b.until)
-    same = a.flight.digest(until) == b.flight.digest(until)
+    same = a.digest(until) == b.digest(until)
     verdict = "The two are the same flight, to the last bit." if same else "The two are different flights."
     drawn = {"Path, side view": plots.path_figure, "Position and velocity": plots.tracking_figure, "Errors": plots.distance_figure,
                "Rates and tilt": plots.rates_figure}

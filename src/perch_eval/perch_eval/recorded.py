@@ -16,11 +16,13 @@ from perch_eval.ros.recorded_flight import RecordedFlight
 
 
 def read_flight(path: Path, namespace: str = "") -> RecordedFlight:
-    """Read the flight of a file; a truncated or damaged file is read as far as possible, with a warning.
+    """Read the flight of a file, or of the `flight.mcap` in a folder; a truncated or damaged file is read as far as possible, with a
+    warning.
 
     Raises:
         PerchError: no such recording.
     """
+    path = path / "flight.mcap" if path.is_dir() else path
     if not path.is_file():
         raise PerchError(f"{path}: no such recording")
     flight = RecordedFlight(path, namespace)

@@ -49,11 +49,10 @@ def _show(args: argparse.Namespace) -> int:
     for name in ("fps", "speed"):
         if not 0.0 < getattr(args, name) < np.inf:
             raise PerchError(f"--{name} {getattr(args, name):g} is not a number > 0")
-    recording = args.flight / "flight.mcap" if args.flight.is_dir() else args.flight
-    path = args.out or recording.with_suffix(".gif")
-    if path.suffix.lower() not in (".gif", ".mp4", ".png"):
-        raise PerchError(f"{path}: the ending is none of .gif, .mp4 and .png")
-    flight = read_flight(recording, args.namespace)
+    if args.out and args.out.suffix.lower() not in (".gif", ".mp4", ".png"):
+        raise PerchError(f"{args.out}: the ending is none of .gif, .mp4 and .png")
+    flight = read_flight(args.flight, args.namespace)
+    path = args.out or Path(flight.source).with_suffix(".gif")
     flight.known_states("ground_truth/odometry")
     vehicle = identify_vehicle(flight, {} if args.vehicle else read_report(flight), args.vehicle)
     view = FlightView.from_flight(flight, vehicle or load_vehicle("snapdragon"))
