@@ -81,6 +81,12 @@ RECORDINGS = {
 }
 MISSING = "not available"
 RACING_ERROR_MAX = 0.2  # required of every seed: error at the end of racing motion, share of the path [%]
+REQUIRED: dict[str, tuple[str, dict[str, float]]] = {  # of VIO's figures, each at most: in words, and by key
+    "v101": ("1 cm at the end", {"final_error_m": 0.01}),
+    "v101_flight": ("3 % at the end, NEES 1", {"drift_percent": 3.0, "nees_position_mean": 3.0}),
+    "mh01": ("5 cm at the end, 1.5 deg", {"final_error_m": 0.05, "attitude_rms_deg": 1.5}),
+    "floor": ("5 cm at the end, 1.5 deg", {"final_error_m": 0.05, "attitude_rms_deg": 1.5}),
+}
 INTRODUCTION = """
 What `scripts/perceive.py` makes of public recordings and photographs of real sensors, against their repositories' own references.
 Nothing is random but which six tags of the clipboard make a board (fixed seed). The recordings are not part of this repository;
@@ -138,14 +144,20 @@ found."""
 # -- the page --------------------------------------------------------------------------------------------------------
 
 
-def motion(f: Figures) -> list[str]:
+def required(key: str, vio: Figures) -> str:
+    """Return whether VIO's figures on a recording are within what is required, with the bars."""
+    text, bars = REQUIRED[key]
+    return f"{'holds' if all(vio[name] is not None and vio[name] <= bar for name, bar in bars.items()) else 'fails'} ({text})"
+
+
+def motion(key: str, f: Figures) -> list[str]:
     """Cells of a row on odometry."""
     vio = f["vio"]
     ate = "-" if vio["ate_rmse_m"] is None else f"{100 * vio['ate_rmse_m']:.2f} cm" + (
         "" if vio["ate_rmse_deg"] is None else f", {vio['ate_rmse_deg']:.2f} deg")
     drift = "" if vio["drift_percent"] is None else f", {vio['drift_percent']:.2f} %"
     return [f"{vio['compared_s']:.1f} s, {vio['path_m']:.1f} m", ate, f"{100 * vio['final_error_m']:.1f} cm{drift}",
-            f"{vio['attitude_rms_deg']:.2f} deg", f"{vio['nees_position_mean'] / 3:.1f}", str(f["restarts"])]
+            f"{vio['attitude_rms_deg']:.2f} deg", f"{vio['nees_position_mean'] / 3:.1f}", str(f["restarts"]), required(key, vio)]
 
 
 def l515(f: Figures) -> str:
@@ -222,8 +234,8 @@ def page(results: Mapping[str, Figures], command: str, code: Mapping[str, str]) 
     lines = ["# Perception on recordings", "", banner([code["commit"]], [code["digest"]]), "", f"Made by `{command}` on {machine()}. This page is generated.",
              INTRODUCTION, *table("recording | what it is | source | licence", (
                  (r.title, r.about, ", ".join(f"`{p}`" for p in r.paths) or "this repository", r.licence) for r in RECORDINGS.values())),
-             ODOMETRY, *table("recording | compared | ATE | at the end | attitude | NEES per dimension | restarts", (
-                 [RECORDINGS[key].title, *(motion(results[key]) if key in results else [MISSING])]
+             ODOMETRY, *table("recording | compared | ATE | at the end | attitude | NEES per dimension | restarts | required: at most", (
+                 [RECORDINGS[key].title, *(motion(key, results[key]) if key in results else [MISSING])]
                  for key in ("v101", "v101_flight", "mh01", "floor")))]
     if "v101" in results:
         f = results["v101"]

@@ -85,6 +85,16 @@ def test_racing_motion_holds_where_every_seed_does(bench, errors, verdict):
     assert verdict in bench.race({"flight": "a", "path_m": 40.0, "error_percent": errors, "nees": 1.0, "lost": 0})
 
 
+@pytest.mark.parametrize("key, figures, verdict", [
+    ("v101", {"final_error_m": 0.01}, "holds"), ("v101", {"final_error_m": 0.011}, "fails"), ("v101", {"final_error_m": None}, "fails"),
+    ("v101_flight", {"drift_percent": 2.9, "nees_position_mean": 2.9}, "holds"),
+    ("v101_flight", {"drift_percent": 2.9, "nees_position_mean": 3.1}, "fails"),
+    ("v101_flight", {"drift_percent": 3.1, "nees_position_mean": 2.9}, "fails"),
+    ("mh01", {"final_error_m": 0.05, "attitude_rms_deg": 1.5}, "holds"), ("mh01", {"final_error_m": 0.05, "attitude_rms_deg": 1.6}, "fails")])
+def test_odometry_holds_where_every_figure_is_within_its_bar(bench, key, figures, verdict):
+    assert bench.required(key, figures).startswith(verdict)
+
+
 def test_the_page_is_that_of_its_figures(bench):
     folder = ROOT / "docs" / "results" / "recordings"
     page = "\n".join(bench.page(json.loads((folder / "results.json").read_text())["recordings"], "a command", {"commit": "", "digest": ""}))
