@@ -9,6 +9,7 @@ import numpy as np
 
 OK, WARNING, FAILS = "ok", "warning", "fails"
 RATE_MAX = 10_000.0  # rate of a sensor [Hz]
+RATE_TOLERANCE = 0.01  # share by which a rate may lie below a bound: clocks differ
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,13 @@ def check_rate(report: Report, about: str, stamps: np.ndarray, minimum: float, r
     gap = (intervals > 1.8 * period) & (beside[:-2] + intervals + beside[2:] > 3.5 * period)
     jitter, gaps = float(intervals[~gap].std() / period) if not gap.all() else np.nan, intervals[gap]
     report.figures[f"{about} rate_hz"] = rate
+    slow = rate < (1.0 - RATE_TOLERANCE) * recommended
     wrong = nominal is not None and not 0.8 < rate / nominal < 1.25
     report.add(f"{about} rate",
                f"{rate:.1f} Hz over {1e-9 * (stamps[-1] - stamps[0]):.1f} s" + (f", {nominal:g} Hz in the sensor file" if wrong else "") +
-               (f": at least {recommended:g} Hz are recommended" if rate < recommended else "") +
+               (f": at least {recommended:g} Hz are recommended" if slow else "") +
                (": stamps are not in nanoseconds" if rate > RATE_MAX else ""),
-               warning=rate < recommended or wrong, fails=not minimum <= rate <= RATE_MAX)
+               warning=slow or wrong, fails=not (1.0 - RATE_TOLERANCE) * minimum <= rate <= RATE_MAX)
     report.add(f"{about} jitter",
                f"{1e3 * jitter * period:.2f} ms (1 sigma), {100 * jitter:.0f} % of the period" +
                (": stamps are taken on arrival, or in batches; stamp where the sensor is sampled" if jitter > 0.1 else ""),
