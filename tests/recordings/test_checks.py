@@ -129,8 +129,6 @@ def test_a_close_scene_changes_the_size_of_the_turns_and_no_more(factor, matches
     assert ("does not match" not in text) == matches, text
 
 
-def test_the_command_says_it_by_its_exit_code(files, capsys):
-    assert sensors_command.main(["check", str(files / "mcap"), "--sensors", str(files / "mine.yaml")]) == 0
 def test_translation_close_to_the_floor_widens_the_sigma_of_the_clock(heard, monkeypatch):
     """It looks like turns and shifts the estimate by 10 ms; neighbouring errors that are alike show it."""
     monkeypatch.setattr(camera_check, "SPAN", 8.0)
@@ -148,6 +146,8 @@ def test_a_rate_as_recommended_is_well_whatever_the_clocks(rate, level):
     assert report.findings[0].level == level
 
 
+def test_the_command_says_it_by_its_exit_code(files, capsys):
+    assert sensors_command.main(["check", str(files / "mcap"), "--sensors", str(files / "mine.yaml")]) == 0
     told = capsys.readouterr().out
     assert "rest" in told and "gyro noise" in told and "warning" not in told
     assert sensors_command.main(["check", str(files / "none")]) == 2
