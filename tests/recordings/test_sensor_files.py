@@ -51,6 +51,21 @@ def test_kalibr_says_the_same(tmp_path):
     np.testing.assert_allclose(mount.camera.project(points)[0], expected, atol=1e-6)
 
 
+def test_openvins_gives_the_inverse_transform(tmp_path):
+    """Its EuRoC configuration has T_imu_cam, camera to IMU: our shipped file, made of the data set's sensor.yaml, has the same pose."""
+    chain, _ = photo_flight.kalibr(tmp_path)
+    rows = ([0.0148655429818, -0.999880929698, 0.00414029679422, -0.0216401454975],
+            [0.999557249008, 0.0149672133247, 0.025715529948, -0.064676986768],
+            [-0.0257744366974, 0.00375618835797, 0.999660727178, 0.00981073058949], [0.0, 0.0, 0.0, 1.0])
+    text = chain.read_text()
+    chain.write_text("%YAML:1.0\n" + text[:text.index("  T_cam_imu")] + "  T_imu_cam:\n" + "".join(f"    - {row}\n" for row in rows)
+                     + text[text.index("  cam_overlaps"):])
+    mount, shipped = from_kalibr(chain, None, "mine").mounts["cam0"], load_sensors("euroc").mounts["cam0"]
+    np.testing.assert_allclose(mount.p_BC, shipped.p_BC, atol=1e-9)
+    np.testing.assert_allclose(mount.R_BC, shipped.R_BC, atol=1e-8)
+    assert mount.stamp_offset == pytest.approx(photo_flight.STAMP_OFFSET)
+
+
 def test_an_imu_that_is_mounted_turned(tmp_path):
     R_BI = Rotation.from_euler("xyz", [20.0, -35.0, 110.0], degrees=True)
     plain, turned = (from_kalibr(*photo_flight.kalibr(tmp_path), "mine", R) for R in (np.eye(3), R_BI.as_matrix()))

@@ -26,7 +26,7 @@ def from_kalibr(cameras: Path, imu: Path | None, name: str, R_BI: np.ndarray = n
     """Convert a Kalibr calibration.
 
     Args:
-        cameras: `camchain-imucam.yaml`: with `T_cam_imu` of every camera.
+        cameras: `camchain-imucam.yaml`: with `T_cam_imu` of every camera, or its inverse `T_imu_cam`, as OpenVINS has it.
         imu: `imu.yaml`; None: cameras only.
         name: of the sensors.
         R_BI: axes of the IMU in the body, shape (3, 3).
@@ -95,10 +95,13 @@ def _plain(value: Any) -> Any:
 def _kalibr_camera(source: str, key: str, c: Any, R_BI: np.ndarray) -> dict[str, Any]:
     if not isinstance(c, dict):
         raise ConfigError(source, key, "is no mapping")
-    if "T_cam_imu" not in c:
+    if "T_cam_imu" in c:
+        T_IC = np.linalg.inv(_transform(source, f"{key}.T_cam_imu", c["T_cam_imu"]))
+    elif "T_imu_cam" in c:
+        T_IC = _transform(source, f"{key}.T_imu_cam", c["T_imu_cam"])
+    else:
         raise ConfigError(source, f"{key}.T_cam_imu", "missing: give the result of kalibr_calibrate_imu_camera (camchain-imucam)")
-    T_CI = _transform(source, f"{key}.T_cam_imu", c["T_cam_imu"])
-    out = _camera(source, f"{key}.", c, c.get("distortion_coeffs", []), np.linalg.inv(T_CI), R_BI)
+    out = _camera(source, f"{key}.", c, c.get("distortion_coeffs", []), T_IC, R_BI)
     # Kalibr: t_imu = t_cam + timeshift
     shift = _number(source, f"{key}.timeshift_cam_imu", c.get("timeshift_cam_imu", 0.0))
     if abs(shift) > 0.5:
