@@ -1,5 +1,7 @@
 """`scripts/sensors.py check`: what would make perception fail is named, and what is well is not."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -8,14 +10,14 @@ from perch_core.values import CameraImage
 from perch_eval.recordings import camera_check, sensors_command
 from perch_eval.recordings.check import check
 from perch_eval.recordings.evaluation import evaluate
-from perch_eval.recordings.findings import Report
-from perch_eval.recordings.imu_check import allan_deviation, check_imu, stretches_at_rest
+from perch_eval.recordings.findings import Report, check_rate
+from perch_eval.recordings.imu_check import allan_deviation, check_estimated_biases, check_imu, stretches_at_rest
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.recording import IMU, Recording, RecordingError
 from perch_eval.recordings.trajectory import Trajectory, read_trajectory, write_tum
-
-
 from recordings import photo_flight
+
+
 @pytest.fixture(scope="module")
 def heard(files):
     """The events of the bag with compressed images, and its sensors."""
@@ -200,6 +202,18 @@ def test_means_at_rest_are_within_three_sigma_of_the_turn_on_bias(axis, bias, ab
     assert found[about].level == level and ("3 sigma of the sensor file" in found[about].text) == (level == "warning")
     assert found["imu rate"].level == "ok" and "imu units" not in found
     assert all(f.level == "ok" for name, f in found.items() if name != about)
+
+
+@pytest.mark.parametrize("accel, gyro, warned", [(0.29, 0.05, []), (-0.31, 0.05, ["accel_bias"]), (0.1, -0.07, ["gyro_bias"])])
+def test_estimated_biases_beyond_three_sigma_are_to_be_declared(accel, gyro, warned):
+    """The greatest on any axis at any time, also where a later one is smaller."""
+    sensor = ImuSensor(rate=200.0, accel_noise_density=0.01, gyro_noise_density=0.01, accel_bias_walk=0.002, gyro_bias_walk=2e-4,
+                       accel_bias=0.1, gyro_bias=0.02)
+    states = [SimpleNamespace(gyro_bias=(0.0, share * gyro, 0.0), accel_bias=(0.0, 0.0, share * accel)) for share in (0.2, 1.0, 0.5)]
+    report = Report()
+    check_estimated_biases(report, states, sensor)
+    assert [name for f in report.findings if f.level == "warning" for name in ("accel_bias", "gyro_bias") if f"declare {name} in the" in f.text] == warned
+    assert len(report.findings) == 2 and report.figures["accel_bias_sigmas"] == pytest.approx(abs(accel) / 0.1)
 
 
 def test_stamps_that_are_none_fail():

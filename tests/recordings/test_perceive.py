@@ -60,6 +60,20 @@ def test_the_board_is_where_it_lies_and_there_is_no_wire(euroc, flight):
     assert np.linalg.norm(np.median(seen, axis=0) - pad) < 0.02
 
 
+def test_biases_within_what_is_declared_are_no_warning(euroc):
+    levels = {f["about"]: f["level"] for f in report(euroc)["findings"]}
+    assert levels["accel bias of VIO"] == levels["gyro bias of VIO"] == "ok"
+
+
+def test_an_accelerometers_bias_beyond_the_sensor_file_is_to_be_declared(files, tmp_path, capsys):
+    """0.1 m/s^2 along gravity, where 0.01 is declared."""
+    mine = yaml.safe_load((files / "mine.yaml").read_text())
+    mine["imu"]["accel_bias"] = 0.01
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(mine))
+    assert perceive(files / "mcap", "--sensors", tmp_path / "mine.yaml", "--out", tmp_path, "--without", "target_localizer", "powerline_mapper") == 0
+    assert "warning: accel bias of VIO: " in (said := capsys.readouterr().out) and "declare accel_bias in the sensor file" in said
+
+
 def test_the_page_shows_it(euroc):
     page = (euroc / "report.html").read_text()
     names = ("The path", "Error and covariance", "Biases", "Tracks", "The board", "Wires", "The sensors")

@@ -66,6 +66,11 @@ def test_openvins_gives_the_inverse_transform(tmp_path):
     assert mount.stamp_offset == pytest.approx(photo_flight.STAMP_OFFSET)
 
 
+def test_the_file_says_where_the_turn_on_biases_come_from(files):
+    text = (files / "mine.yaml").read_text()
+    assert "# accel_bias of imu, 1 sigma, is 0.2 m/s^2 by default: put the data sheet's zero-g offset there" in text and "# gyro_bias of imu" in text
+
+
 def test_an_imu_that_is_mounted_turned(tmp_path):
     R_BI = Rotation.from_euler("xyz", [20.0, -35.0, 110.0], degrees=True)
     plain, turned = (from_kalibr(*photo_flight.kalibr(tmp_path), "mine", R) for R in (np.eye(3), R_BI.as_matrix()))

@@ -24,6 +24,7 @@ from perch_eval.recordings.calibration import to_yaml
 from perch_eval.recordings.check import check
 from perch_eval.recordings.evaluation import Evaluation, evaluate
 from perch_eval.recordings.drawing import Gallery
+from perch_eval.recordings.imu_check import check_estimated_biases
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.perception import Perception, node_config
 from perch_eval.recordings.image_detections import detect, draw_detections, guessed_mount
@@ -114,6 +115,8 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
     for event in recording.read():
         perception.process(event)
     checked, vio = check(recording), _trajectory(perception.states)
+    if sensors.imu is not None:
+        check_estimated_biases(checked, perception.states, sensors.imu)
     content = ReportContent({"recording": str(recording.path), "camera": down, "front": front, "images": recording.images,
                              "imu_samples": recording.samples, "damage": recording.damage},
                             [("recording", str(recording.path.resolve())),

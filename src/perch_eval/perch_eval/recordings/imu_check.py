@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from perch_core.sensors import ImuSensor
+from perch_core.values import InertialState
 from perch_core.vehicle import GRAVITY
 from perch_eval.recordings.findings import Report, check_rate
 
 STILL_WINDOW = 0.2  # [s]
 STILL_MEAN = (0.02, 0.2)  # by how much a window's mean may differ from those before it, at rest [rad/s, m/s^2]
 GYRO_BIAS_MAX = 0.2  # mean at rest above which a warning is given, whatever the sensor file allows [rad/s]
-BIAS_SIGMAS = 3.0  # by how many sigma of the turn-on bias a mean at rest may be off
+BIAS_SIGMAS = 3.0  # by how many sigma of the turn-on bias a mean at rest, or an estimate, may be off
 STILL_SIGMA = (0.3, 2.0)  # 1 sigma within a window: rotors that idle shake the vehicle, but do not move it [rad/s, m/s^2]
 
 
@@ -77,6 +80,22 @@ def _check_biases(report: Report, gyro: np.ndarray, accel: np.ndarray, sensor: I
         more = abs(force - GRAVITY) > allowed
         report.add("accel bias", f"the specific force at rest differs from gravity by {force - GRAVITY:+.3f} m/s^2" +
                    (f": more than {allowed:.2g}, {BIAS_SIGMAS:g} sigma of the sensor file" if more else ""), warning=more)
+
+
+def check_estimated_biases(report: Report, states: Sequence[InertialState], sensor: ImuSensor) -> None:
+    """Check the greatest biases that VIO estimated on an axis against the turn-on biases of the sensor file.
+
+    The estimate of a larger bias than declared is drawn towards zero, and its covariance is too small.
+    """
+    if not states:
+        return
+    for name, unit, source in (("gyro_bias", "rad/s", "zero-rate offset"), ("accel_bias", "m/s^2", "zero-g offset")):
+        greatest = float(np.abs([getattr(state, name) for state in states]).max())
+        sigmas = greatest / getattr(sensor, name)
+        report.figures[f"{name}_sigmas"] = sigmas
+        more = sigmas > BIAS_SIGMAS
+        report.add(f"{name.replace('_', ' ')} of VIO", f"at most {greatest:.2g} {unit} on an axis, {sigmas:.1f} sigma of the sensor file" +
+                   (f": declare {name} in the sensor file: the data sheet's {source}, 1 sigma" if more else ""), warning=more)
 
 
 def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor | None) -> None:

@@ -63,9 +63,12 @@ def _import(args: argparse.Namespace) -> int:
         if root is None or len(args.files) > 1:
             raise ConfigError("import euroc", str(args.files[-1]), "is no folder with mav0/cam0")
         sensors = from_asl(root, R_BI)
-    text = to_yaml(
-        _renamed(sensors, args), f"Made by `scripts/sensors.py import {args.kind}` of {', '.join(file.name for file in args.files)}.\n"
-        "1 sigma of the calibration (`sigma`) and turn-on biases are defaults: see calibration report and data sheet.")
+    comment = (f"Made by `scripts/sensors.py import {args.kind}` of {', '.join(file.name for file in args.files)}.\n"
+               "1 sigma of the calibration (`sigma`) are defaults: see the calibration report.")
+    if sensors.imu is not None:
+        comment += (f"\naccel_bias of imu, 1 sigma, is {sensors.imu.accel_bias:g} m/s^2 by default: put the data sheet's zero-g offset there."
+                    f"\ngyro_bias of imu, 1 sigma, is {sensors.imu.gyro_bias:g} rad/s by default: put the data sheet's zero-rate offset there.")
+    text = to_yaml(_renamed(sensors, args), comment)
     if args.out is None:
         print(text, end="")
     else:
