@@ -183,6 +183,18 @@ def findings(stamps, still, sensor=None, off=np.zeros(6)):
     return {finding.about: finding for finding in report.findings}
 
 
+def test_an_impact_that_fades_out_in_the_first_window_of_a_rest_is_no_noise():
+    """As that of a perch: a turn of 0.25 rad/s that swings, and falls to 1/e in 60 ms."""
+    t = 0.005 * np.arange(441)
+    density = 0.01 / np.sqrt(200.0)  # of the white noise of `findings`
+    sensor = ImuSensor(rate=200.0, accel_noise_density=density, gyro_noise_density=density, accel_bias_walk=0.002, gyro_bias_walk=2e-4,
+                       accel_bias=0.1, gyro_bias=0.02)
+    impact = np.zeros((len(t), 6))
+    impact[t >= 1.0, 1] = 0.25 * np.exp(-(t[t >= 1.0] - 1.0) / 0.06) * np.cos(40.0 * (t[t >= 1.0] - 1.0))
+    found = findings((1e9 * t).astype(np.int64), t >= 1.0, sensor, impact)
+    assert "still for 1.0 s from 1.0 s on" in found["rest"].text and found["gyro noise"].level == "ok"
+
+
 def test_rest_at_the_start_counts_though_another_is_longer():
     t = 0.005 * np.arange(2200)
     stamps = (1e9 * t).astype(np.int64)

@@ -12,6 +12,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from perch_core.sensors import load_sensors
+from perch_core.values import ImuSample
+from perch_eval.flight import timed
 from perch_eval.recordings import command
 from perch_eval.recordings.asl import AslRecording
 from perch_eval.recordings.bag import BagRecording, _topic
@@ -19,6 +21,7 @@ from perch_eval.recordings.command import _unused
 from perch_eval.recordings.recording import RecordingError
 from perch_eval.recordings.trajectory import read_trajectory, read_truth
 from recordings import photo_flight
+from unit.recorded_flights import flown, record
 
 
 def perceive(*arguments) -> int:
@@ -93,6 +96,22 @@ def test_a_bag_that_broke_off_is_read_as_far_as_it_goes_with_its_truth_on_a_topi
     assert seen["vio"]["ate_rmse_m"] < 0.015 and seen["vio"]["path_m"] > 0.5
     vio, true = read_trajectory(tmp_path / "out" / "vio.tum"), read_trajectory(tmp_path / "out" / "truth.tum")
     assert true.stamps[0] == photo_flight.START and len(vio) > 50  # to the nanosecond
+
+
+def test_the_truth_that_the_simulator_records_beside_the_imu_is_used(files):
+    """It is that of the body: an IMU that is mounted turned has its axes turned in it."""
+    sensors = load_sensors(files / "mine.yaml")
+    recording = BagRecording(files / "mcap", replace(sensors, imu=replace(sensors.imu, orientation=(1.0, 0.0, 0.0, 0.0))))
+    assert read_truth(recording, None) is None
+    recording.truth_topic = "/truth"  # in place of ground_truth/odometry
+    body, imu = read_truth(recording, "/truth"), read_truth(recording, None)
+    np.testing.assert_allclose(Rotation.from_quat(imu.q[:9]).as_matrix(), Rotation.from_quat(body.q[:9]).as_matrix() @ np.diag([1.0, -1.0, -1.0]), atol=1e-9)
+    np.testing.assert_array_equal(imu.p, body.p)
+
+
+def test_the_truth_of_a_recording_of_perch_is_found(tmp_path):
+    record(tmp_path / "flight.mcap", {**flown(), "imu/data_raw": timed(ImuSample(k * 2_000_000, np.zeros(3), np.zeros(3)) for k in range(9))})
+    assert BagRecording(tmp_path / "flight.mcap", None).truth_topic == "/ground_truth/odometry"
 
 
 def test_topics_that_the_recording_lacks_are_those_of_the_nodes(files):

@@ -32,6 +32,9 @@ class BagRecording(Recording):
     """A bag. A camera's topic is the one in the sensor file, or else `camera_<name>/image_raw` (or `/compressed` below it).
 
     A truncated `.mcap` is read as far as possible, from a copy that has an index.
+
+    Attributes:
+        truth_topic: topic of the simulator's true motion of the body, beside the IMU's; empty: it is not recorded.
     """
     def __init__(self, path: Path, sensors: Sensors | None) -> None:
         """
@@ -65,6 +68,8 @@ class BagRecording(Recording):
             if sensors.imu is not None and not self._imu:
                 raise RecordingError(f"{path}: no IMU on {sensors.imu.topic or 'imu/data_raw'} (`topic` of the IMU in sensor file {sensors.name}) "
                                      f"or imu/data_raw; there are: {', '.join(imus) or 'none'}")
+        truth = self._imu.removesuffix("imu/data_raw") + "ground_truth/odometry"
+        self.truth_topic = truth if truth in kinds else ""
         self.images = {name: counts[topic] for name, topic in self._cameras.items()}
         self.samples = counts[self._imu] if self._imu else 0
 

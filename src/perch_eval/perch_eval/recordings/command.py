@@ -59,7 +59,8 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--sensors", metavar="FILE",
                      help="sensor file, or its name in config/sensors (default: the recording's own calibration)")
     out.add_argument("--truth", metavar="FILE",
-                     help="true motion of the IMU's axes: TUM or EuRoC file, or a topic of the bag (default: the recording's own)")
+                     help="true motion of the IMU's axes: TUM or EuRoC file, or a topic of the bag (default: the recording's own; of a "
+                          "recording of perch, ground_truth/odometry)")
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     out.add_argument("--camera", metavar="NAME", help="camera of VIO (default: down, or the first)")
     out.add_argument("--front", metavar="NAME", help="camera of target localiser and powerline mapper (default: front, or that of VIO)")

@@ -57,6 +57,8 @@ def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSe
                (f", for {at_start:.1f} s at the start" if at_start < duration else "") +
                (": VIO may have to start in motion" if at_start < 0.5 else ""),
                warning=at_start < 0.5)
+    at_edge = round(STILL_WINDOW * rate)  # in the first and the last window a motion may fade out or begin
+    first, last = first + at_edge, last - at_edge
     _check_biases(report, gyro[first:last].mean(axis=0), accel[first:last].mean(axis=0), sensor)
     if shared > 0.01:
         report.add("noise", f"not judged: {100 * shared:.0f} % of the samples have the stamp of the one before")

@@ -90,14 +90,17 @@ def read_truth(recording: Recording, given: str | None) -> Trajectory | None:
 
     Args:
         recording: the recording.
-        given: a file in TUM's or EuRoC's format, or a topic of the bag; None: the recording's own truth.
+        given: a file in TUM's or EuRoC's format, or a topic of the bag; None: the recording's own truth, also that of the simulator.
 
     Returns:
-        The motion; None if there is none.
+        The motion of the IMU's axes; None if there is none.
 
     Raises:
         RecordingError: it cannot be read.
     """
+    if given is None and isinstance(recording, BagRecording) and recording.truth_topic:
+        body, imu = read_truth(recording, recording.truth_topic), recording.sensors.imu if recording.sensors else None
+        return body.turned(so3.quat_from_matrix(imu.R_BI)) if body and imu else body
     if given is None:
         file = recording.truth
         if file is None:
