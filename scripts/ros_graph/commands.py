@@ -11,6 +11,8 @@ from perch_setup import command_parser, enter, quiet_on_interrupt
 from perch_setup.enter import INTERRUPTED
 from perch_setup.errors import FAILED, USAGE_ERROR
 
+_ADVICE = "Is the stack ready? Wait until start_stack.py prints `ready`, then try again."
+
 
 class GraphError(Exception):
     """Raised when the graph does not fit the request. The message is one line."""
@@ -93,9 +95,12 @@ def carry_out(command_line: argparse.ArgumentParser) -> int:
             code = handler(graph, arguments)
         sys.stdout.flush()
         return code
+    except NoAnswerError as error:
+        print(f"error: {error}. {_ADVICE}", file=sys.stderr)
+        return FAILED
     except (GraphError, PerchError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return FAILED if isinstance(error, NoAnswerError) else USAGE_ERROR
+        return USAGE_ERROR
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:  # `topic.py echo ... | head`

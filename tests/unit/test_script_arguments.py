@@ -76,8 +76,10 @@ def test_what_can_be_is_accepted(run, name, arguments):
     assert [path.name for path in Path().iterdir()] == ["file"]  # nothing is left of the trial
 
 
-@pytest.mark.parametrize("error, code", [(GraphError("service /arm does not exist"), 2), (NoAnswerError("/arm: no answer within 30 s"), 1)])
-def test_a_name_that_does_not_exist_is_a_wrong_argument_and_silence_is_a_failure(monkeypatch, capsys, error, code):
+@pytest.mark.parametrize("error, code, advice", [
+    (GraphError("service /arm does not exist"), 2, ""),
+    (NoAnswerError("/arm: no answer within 30 s"), 1, ". Is the stack ready? Wait until start_stack.py prints `ready`, then try again.")])
+def test_a_name_that_does_not_exist_is_a_wrong_argument_and_silence_is_a_failure(monkeypatch, capsys, error, code, advice):
     def fail(*_):
         raise error
 
@@ -85,7 +87,8 @@ def test_a_name_that_does_not_exist_is_a_wrong_argument_and_silence_is_a_failure
     monkeypatch.setattr("ros_graph.connection.connect", nullcontext)
     monkeypatch.setattr("ros_graph.calls.call_service", fail)
     monkeypatch.setattr(sys, "argv", ["service.py", "call", "/arm", "std_srvs/srv/SetBool"])
-    assert commands.carry_out(service.command_line()) == code and capsys.readouterr().err == f"error: {error}\n"
+    assert commands.carry_out(service.command_line()) == code
+    assert capsys.readouterr().err == f"error: {error}{advice}\n"
 
 
 def test_ctrl_c_in_a_benchmark_that_waits_for_nodes_ends_all_of_them(monkeypatch):
