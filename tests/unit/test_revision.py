@@ -7,10 +7,11 @@ import json
 import re
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from perch_eval import revision
-from perch_eval.evaluation import front_page
+from perch_eval.evaluation import front_page, front_pictures
 
 RESULTS = Path(__file__).resolve().parents[2] / "docs" / "results"
 PAGES = sorted(RESULTS.rglob("*.md"))
@@ -121,3 +122,26 @@ def test_the_front_page_shows_what_the_pages_of_results_say():
     readme = (RESULTS.parents[1] / "README.md").read_text()
     assert front_page.BEGIN + front_page.table() + front_page.END in readme, "python3 -m perch_eval.evaluation.front_page"
     assert len(readme.splitlines()) <= 200
+
+
+@pytest.mark.skipif(not NOW, reason="not in a git repository")
+def test_the_pictures_of_the_front_page_are_of_this_code_or_said_to_be_older():
+    readme = (RESULTS.parents[1] / "README.md").read_text()
+    assert len(front_pictures.CAPTION.findall(readme)) == 1 and set(re.findall(r"docs/images/([^)]+)", readme)) == set(front_pictures.PICTURES)
+    assert not revision.out_of_date(readme, NOW), "python3 -m perch_eval.revision, or python3 -m perch_eval.evaluation.front_pictures"
+
+
+def test_the_pictures_have_the_commit_of_the_code_that_flew_and_are_marked_once_it_has_changed(tmp_path, monkeypatch):
+    monkeypatch.setattr(front_pictures, "root", lambda: tmp_path)
+    monkeypatch.setattr(front_pictures, "code_version", lambda: {"commit": "1234567", "digest": "0123456789ab"})
+    flown, drawn = [], []
+    monkeypatch.setattr(front_pictures.subprocess, "run", lambda words: flown.append(words) or SimpleNamespace(returncode=0))
+    monkeypatch.setattr(front_pictures.replay, "main", lambda words: drawn.append(words[-1]))
+    readme = tmp_path / "README.md"
+    readme.write_text("# perch\n\nPictures **of commit 7654321, older than the code**. Drawn.\n")
+    assert front_pictures.main(["--out", str(tmp_path)]) == 0 and len(flown) == 3
+    assert drawn == [str(tmp_path / "docs" / "images" / name) for name in front_pictures.PICTURES]
+    assert readme.read_text() == "# perch\n\nPictures **of commit 1234567** (digest 0123456789ab). Drawn.\n"
+    monkeypatch.setattr(revision, "digest", lambda: "ba9876543210")
+    assert revision.mark([readme]) == [readme] and front_pictures.CAPTION.search(readme.read_text())
+    assert "**of commit 1234567, older than the code** (digest 0123456789ab)." in readme.read_text()
