@@ -22,7 +22,7 @@ from perch_eval.recorded import identify_vehicle, read_flight, read_report
 from perch_eval.scene_3d import scene_3d
 
 COLOURS = ("#1f77b4", "#d95f02")
-REPORT_FIELDS = ("outcome", "scenario", "vehicle", "seed", "date", "commit", "digest", "command", "machine", "message")  # shown as text
+REPORT_FIELDS = ("outcome", "scenario", "vehicle", "seed", "date", "commit", "digest", "message")  # shown as text
 EXAMPLES = """examples:
   python3 scripts/compare.py out/flight.mcap /tmp/flight/flight.mcap   page compare.html in this folder
   python3 scripts/compare.py before after --out before_after.html      folders of demo.py, with flight.mcap and report.json
