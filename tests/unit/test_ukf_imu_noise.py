@@ -30,6 +30,18 @@ def test_white_noise_is_found_at_any_rate(rate):
     assert np.mean(found) == pytest.approx(0.09, rel=0.05)
 
 
+def test_noise_is_found_behind_the_low_pass_filter_of_an_imu():
+    """Noise of density 1 behind a first-order filter of 42 Hz, at 1 kHz: the filter does not change its density at low frequency."""
+    rate, rng, found = 1000.0, np.random.default_rng(3), []
+    for _ in range(40):
+        noise, x = MeasuredNoise(0.1), np.zeros(3)
+        for _ in range(round(1.5 * rate)):
+            x += (1.0 - np.exp(-2.0 * np.pi * 42.0 / rate)) * (rng.normal(0.0, np.sqrt(rate), 3) - x)
+            variance, _ = noise.add(tuple(x), 1.0 / rate, False)
+        found.append(variance / rate)
+    assert 0.15 < np.mean(found) < 1.0, "differences of single samples find 0.02"
+
+
 @pytest.mark.parametrize("rate", [200.0, 500.0])
 def test_a_motion_is_no_noise(rate):
     noise = MeasuredNoise(IMU.accel_noise_density)

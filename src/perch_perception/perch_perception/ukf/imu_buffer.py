@@ -17,34 +17,46 @@ _GAP_ACCEL = 5.0  # 1 sigma of what a missing sample may have been [m/s^2]
 _GAP_GYRO = 2.0  # the same [rad/s]
 _PERIODS = 9  # last intervals whose median is the period
 _MAX_SQUARE = 1e8  # square of what no IMU measures [rad^2/s^2 + m^2/s^4]
+_MEAN_TIME = 0.005  # of the samples whose differences measure the noise [s]
 _NOISE_WINDOW = 0.25  # time constant of the measured noise [s]
 _MIN_NOISE = 0.1  # least measured variance that is believed, as a share of the sensor file's: that of one that is not shaken
 
 
 class MeasuredNoise:
-    """Variance of one sample of a sensor, from its samples' third differences.
+    """Density of a sensor's noise, from the third differences of its means over `_MEAN_TIME`.
 
-    A smooth motion vanishes in them, while white noise of variance s^2 gives 20 s^2 (von Neumann et al. 1941, for first differences).
-    The airframe's vibration counts as noise. The sensor file's noise holds until samples show another.
+    A smooth motion vanishes in them, while means over T of white noise of density d give 20 d^2 / T (von Neumann et al. 1941, for
+    first differences). Means, since the low-pass filter of an IMU correlates samples of a few milliseconds. The airframe's
+    vibration counts as noise. The sensor file's noise holds until samples show another.
     """
 
     def __init__(self, density: float) -> None:
         """`density`: of the sensor's noise, as in the sensor file [unit/sqrt(Hz)]."""
-        self._density2, self._variance = density**2, 0.0
-        self._last: tuple[tuple[float, ...], ...] = ()  # the last three samples
+        self._declared = self._measured = density**2
+        self._integral, self._time = (0.0, 0.0, 0.0), 0.0  # of the samples since the last mean
+        self._last: tuple[tuple[float, ...], ...] = ()  # the last three means
+        self._count = 1  # of estimates; the sensor file's is the first
 
     def add(self, x: tuple[float, ...], dt: float, after_gap: bool) -> tuple[float, float]:
-        """Add a sample (3,), `dt` [s] after the last one; return the measured variance, and that of the sensor file."""
-        declared = self._density2 / dt
-        if not self._variance:
-            self._variance = declared
-        last = () if after_gap else self._last
-        if len(last) == 3:
-            a, b, c = last
+        """Add a sample (3,), `dt` [s] after the last one; return its variance as measured, and that of the sensor file."""
+        if after_gap:
+            self._integral, self._time, self._last = (0.0, 0.0, 0.0), 0.0, ()
+        else:
+            p, q, r = self._integral
+            self._integral, self._time = (p + dt * x[0], q + dt * x[1], r + dt * x[2]), self._time + dt
+        if self._time > 0.99 * _MEAN_TIME:
+            self._add_mean(tuple(value / self._time for value in self._integral), self._time)
+            self._integral, self._time = (0.0, 0.0, 0.0), 0.0
+        return max(self._measured, _MIN_NOISE * self._declared) / dt, self._declared / dt
+
+    def _add_mean(self, x: tuple[float, ...], duration: float) -> None:
+        if len(self._last) == 3:
+            a, b, c = self._last
             i, j, k = x[0] - a[0] + 3.0 * (b[0] - c[0]), x[1] - a[1] + 3.0 * (b[1] - c[1]), x[2] - a[2] + 3.0 * (b[2] - c[2])
-            self._variance += min(dt / _NOISE_WINDOW, 1.0) * ((i * i + j * j + k * k) / 60.0 - self._variance)
-        self._last = (*last[-2:], x)
-        return max(self._variance, _MIN_NOISE * declared), declared
+            square = duration * (i * i + j * j + k * k) / 60.0
+            self._count += 1
+            self._measured += min(max(duration / _NOISE_WINDOW, 1.0 / self._count), 1.0) * (square - self._measured)
+        self._last = (*self._last[-2:], x)
 
 
 def is_sane(sample: ImuSample) -> bool:
