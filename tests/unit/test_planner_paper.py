@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from perch_core import bernstein
+from perch_core.errors import ConfigError
 from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
@@ -58,6 +61,11 @@ def test_only_violating_segments_and_their_neighbours_grow_until_none_is_left():
         grew = following.program.durations > one.program.durations
         near = [one.violated[max(i - 1, 0):i + 2].any() for i in range(len(grew))]
         assert one.violated.any() and grew.tolist() == near
+
+
+def test_a_problem_without_durations_is_refused():
+    with pytest.raises(ConfigError, match="segment_times"):
+        paper_m.plan(replace(problem(90.0), segment_times=None), SETTINGS, VEHICLE)
 
 
 def test_window_and_tube_are_those_of_what_flies():

@@ -378,6 +378,40 @@ def test_a_low_ceiling_is_refused_for_the_floor_from_every_start(deg, height):
     assert set(caught.value.relaxed) == {"height_min"}
 
 
+@pytest.mark.parametrize("deg", [178.0, 180.0])
+def test_a_ceiling_far_to_the_side_is_refused_for_the_floor(deg):
+    """A search without that limit takes many programs."""
+    problem = PerchProblem(StartState((0.0, 0.0, 1.2)), surface(deg, p=(1.2, 0.0, 2.0)))
+    with pytest.raises(PerchRefusal) as caught:
+        plan(problem, PerchSettings(), VEHICLE)
+    assert set(caught.value.relaxed) == {"height_min"}
+    checked(problem, PerchSettings(**caught.value.relaxed))
+
+
+@pytest.mark.parametrize("key, value, suffices", [("duration_max", 0.5, 1.2), ("duration_max", 1.0, 1.2), ("height_min", 0.95, 0.7)])
+def test_the_value_of_a_refusal_is_near_the_least_that_does(key, value, suffices):
+    problem = PerchProblem(StartState((0.0, 0.0, 1.2)), surface(90.0, p=(1.7, 0.0, 1.2)))
+    with pytest.raises(PerchRefusal) as caught:
+        plan(problem, PerchSettings(**{key: value}), VEHICLE)
+    assert abs(caught.value.relaxed[key] - value) <= abs(suffices - value)
+
+
+@pytest.mark.parametrize("target, velocity", [
+    (surface(0.0, p=(1.5, 0.0, 0.8)), (0.0, 0.0, -0.5)), (surface(90.0, p=(1.7, 0.0, 1.0)), (0.0, 0.0, -0.4))])
+def test_a_pad_that_sinks_to_the_floor_is_met_before(target, velocity):
+    """Only plans much shorter than the first guess meet it above `height_min`."""
+    checked(PerchProblem(HOVER, target, target_velocity=np.array(velocity)))
+
+
+@pytest.mark.parametrize("inclination", [60.0, 90.0, 110.0])
+def test_no_plan_under_a_shorter_duration_max_is_shorter_than_minimum_time(inclination):
+    problem = PerchProblem(StartState((0.0, 0.0, 1.2)), surface(inclination, p=(1.7, 0.0, 1.2)))
+    shortest = checked(problem, PerchSettings(minimum_time=True)).duration
+    for share in (0.97, 0.94, 0.9):
+        with pytest.raises(PerchRefusal):
+            plan(problem, PerchSettings(duration_max=share * shortest), VEHICLE)
+
+
 @pytest.mark.parametrize("seed", [700052, 700101, 700114, 700213])
 def test_a_search_that_fails_begins_again_from_other_durations(seed):
     """Random problems that are planned from the first durations times 1.25 or 0.8 alone."""

@@ -24,7 +24,7 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
 from perch_planner.search import Found, Outcome, Search
 
-PROGRAMS_MAX = 400
+PROGRAMS_MAX = 600
 """Greatest number of quadratic programs in all searches with relaxed limits."""
 _PROGRAMS_PER_TRIAL = 100 # of one of them
 _VALUE_TRIALS = 5         # of values: what the plan took of a limit, then halves of the logarithm

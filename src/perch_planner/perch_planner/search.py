@@ -19,7 +19,7 @@ from perch_planner.time_allocation import (
     FINE_DIVISIONS, allocate, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
 from perch_planner.yaw_profile import yaw_coefficients
 
-STARTS = ((1.0, 100), (1.25, 75), (0.8, 75), (0.6, 50), (0.45, 40))
+STARTS = ((1.0, 100), (1.25, 75), (0.8, 75), (0.55, 50), (0.45, 40))
 """First durations of a search, as factors of the allocated ones, and the greatest number of quadratic programs from each."""
 ITERATIONS_MAX = sum(programs for _, programs in STARTS)
 _CUT_ROUNDS = 24

@@ -143,8 +143,10 @@ class PerchingMission(MissionMachine, Generic[R]):
         elif self._elapsed(inputs) > self.settings.rest_time and inputs.controller is not ControllerState.ATTACHED:
             self._end(outputs, Result.TRACKING_LOST, f"the controller is not attached: {inputs.controller_message}")
         elif self._elapsed(inputs) > self.settings.rest_time:
-            result, prefix = (Result.CANCELLED, "cancelled too late: ") if self._cancelled else (Result.PERCHED, "")
-            self._end(outputs, result, f"{prefix}perched", contact_time=self._contact_time)
+            result, message = Result.PERCHED, "perched"
+            if self._cancelled is not None:
+                result, message = Result.CANCELLED, f"cancelled too late: perched{self._cancelled and f' ({self._cancelled})'}"
+            self._end(outputs, result, message, contact_time=self._contact_time)
         elif inputs.controller in _IN_FLIGHT and inputs.time - self._attached_sent_at > ATTACHED_RETRY:
             self._attached_sent_at = inputs.time
             outputs.commands.append((Command.ATTACHED, "repeated"))  # the first command was lost

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from perch_core import bernstein
+from perch_core.errors import ConfigError
 from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import GRAVITY, Vehicle
 from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP
@@ -242,7 +243,12 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pa
         problem: with `segment_times`, the initial durations, and a static target.
         settings: alpha, v_min, v_max, tube, thrust bounds, objective, solver and `duration_max`; others are ignored.
         vehicle: mass, thrust range and perch offset.
+
+    Raises:
+        ConfigError: the problem has no `segment_times`; the paper has no rule for them.
     """
+    if problem.segment_times is None:
+        raise ConfigError("problem", "segment_times", "are needed: the paper has no rule for the first durations")
     begin = process_time()
     low, high = Limits.of(settings, vehicle).thrust
     durations, solved = np.array(problem.segment_times, float), False
