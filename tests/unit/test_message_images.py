@@ -44,9 +44,9 @@ def test_compressed_images_are_read(kind, shape):
 
 
 def png(width, height):
-    """The few bytes of a PNG that states a size, without its pixels."""
+    """The few bytes of a PNG that states a size; its pixels are cut off."""
     chunk = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk)) + struct.pack(">I", 100) + b"IDAT"
 
 
 def jpeg(width, height):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import array
-import struct
+from io import BytesIO
 
 import cv2
 import numpy as np
@@ -13,11 +13,11 @@ from perch_core.errors import PerchError
 from perch_core.ros.messages.basic import flat, floats, header, quaternion_floats, require_measured, stamp_value, to_quaternion, to_vector
 from perch_core.values import CameraImage, CameraModel, CompressedPixels, ImuSample, StampedTransform, Transform
 from perch_core.values.limits import LIMITS
+from PIL import Image as pillow
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
+pillow.MAX_IMAGE_PIXELS = None  # the limits are those of `CameraImage`
 _GENERIC = {"8UC1": "mono8", "8UC3": "bgr8"}  # what the bytes mean in ROS' generic encodings
-_JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # markers of the segments that state the size of a JPEG
-_JPEG_WITHOUT_LENGTH = frozenset((0x00, 0x01, *range(0xD0, 0xD9)))
 
 
 def imu_value(msg: Imu) -> ImuSample:
@@ -77,19 +77,11 @@ def _stated_size(data: bytes) -> tuple[int, int] | None:
 
     A few kilobytes can state more pixels than fit into memory, and OpenCV gives the size only after it has decoded them.
     """
-    if data.startswith(b"\x89PNG\r\n\x1a\n") and data[12:16] == b"IHDR" and len(data) >= 24:
-        width, height = struct.unpack_from(">II", data, 16)
-        return width, height
-    if not data.startswith(b"\xff\xd8"):
+    try:
+        with pillow.open(BytesIO(data), formats=("JPEG", "PNG")) as image:
+            return image.size
+    except (OSError, ValueError):
         return None
-    at = 2
-    while (at := data.find(b"\xff", at)) >= 0 and at + 9 <= len(data):  # segments: 0xff, marker, length, content
-        marker = data[at + 1]
-        if marker in _JPEG_SIZES:
-            height, width = struct.unpack_from(">HH", data, at + 5)
-            return width, height
-        at += 1 if marker == 0xff else 2 if marker in _JPEG_WITHOUT_LENGTH else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return None
 
 
 def compressed_message(image: CompressedPixels) -> CompressedImage:
