@@ -225,7 +225,7 @@ def test_a_plate_is_held_at_rest_or_refused_but_never_shaken():
         plant.place(pad.p_WS + (offset + 0.005) * pad.normal, so3.quat_from_matrix(pad.R_WS), -0.5 * pad.normal, np.zeros(3), OFF)
         run(plant, 1.5)
         assert plant.contact.attached and np.linalg.norm(plant.state.w_WB_B) < 0.5, offset
-    with pytest.raises(ConfigError, match="vehicles/snapdragon: perch_offset: 0.3 m is too far for 0.25 kg"):
+    with pytest.raises(ConfigError, match="vehicles/snapdragon.yaml: perch_offset: 0.3 m is too far for 0.25 kg"):
         Plant(scenario, dataclasses.replace(VEHICLE, perch_offset=0.3), seed=1, start=1_000_000_000)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -146,10 +147,10 @@ def test_motors_limit_refuse_and_time_out():
     assert np.all(motors.target(141) == 0.0)
 
 
-def test_an_imu_of_another_rate_is_refused(tmp_path, monkeypatch):
-    from perch_sim import simulation
+def test_an_imu_of_another_rate_is_refused_with_the_file_that_states_it(tmp_path):
+    from perch_sim.simulation import Simulation
 
-    other = dataclasses.replace(VEHICLE, imu=dataclasses.replace(VEHICLE.imu, rate=200.0))
-    monkeypatch.setattr(simulation, "load_vehicle", lambda name: other)
-    with pytest.raises(ConfigError, match="imu.rate: 200 is not the control rate of 500 Hz"):
-        simulation.Simulation(load_scenario("surface_90"), 1)
+    file = tmp_path / "my quad.yaml"
+    file.write_text("extends: snapdragon\nimu: {rate: 200.0}\n")
+    with pytest.raises(ConfigError, match=f"^{re.escape(str(file))}: imu.rate: 200 is not the control rate of 500 Hz, the only one"):
+        Simulation(dataclasses.replace(load_scenario("surface_90"), vehicle=str(file)), 1)

@@ -230,10 +230,15 @@ class Vehicle:
         return {name: item.mount(name) for name, item in self.cameras.items()}
 
 
+def vehicle_file(name_or_path: str | Path) -> str:
+    """Return the path of a vehicle's file, for messages; raises ConfigError where there is none."""
+    return str(config.find("vehicles", name_or_path))
+
+
 def load_vehicle(name_or_path: str | Path) -> Vehicle:
     """Return the vehicle of `config/vehicles/<name>.yaml`, or of a file, merged with the files that it extends.
 
     Raises:
         ConfigError: no such vehicle, or a value that is refused.
     """
-    return config.from_mapping(Vehicle, extended_mapping("vehicles", name_or_path), str(config.find("vehicles", name_or_path)))
+    return config.from_mapping(Vehicle, extended_mapping("vehicles", name_or_path), vehicle_file(name_or_path))

@@ -9,7 +9,7 @@ import numpy as np
 
 from perch_core.errors import ConfigError, PerchError
 from perch_core.values import Contact
-from perch_core.vehicle import Vehicle
+from perch_core.vehicle import Vehicle, vehicle_file
 from perch_sim import seeding
 from perch_sim.attachment import FREE
 from perch_sim.body import PLATE_POINTS, Body, hold_rate, make_body
@@ -63,7 +63,7 @@ class Plant:
         """
         self.body = make_body(vehicle, scenario.disturbance)
         if hold_rate(self.body) * STEP > STABLE:
-            raise ConfigError(f"vehicles/{vehicle.name}", "perch_offset", f"{vehicle.perch_offset:g} m is too far for {self.body.mass:g} kg with "
+            raise ConfigError(vehicle_file(scenario.vehicle), "perch_offset", f"{vehicle.perch_offset:g} m is too far for {self.body.mass:g} kg with "
                               f"inertias of {', '.join(f'{J:.3g}' for J in self.body.inertia)} kg m^2: the hold would be unstable")
         self.obstacles = make_obstacles(scenario)
         self.contact = ContactMonitor(self.body.plate_offset, self.obstacles, scenario.adhesion)

@@ -16,7 +16,7 @@ from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import (
     NANOSECONDS, AttitudeThrust, CameraImage, CameraModel, Contact, ImuSample, MotorCommand, OdometryState, PoseStamped, RatesThrust, RotorState,
     Transform, limits, rotated, seconds)
-from perch_core.vehicle import load_vehicle
+from perch_core.vehicle import load_vehicle, vehicle_file
 from perch_sim.camera_stream import Delivery
 from perch_sim.contact_event import ContactState
 from perch_sim.drawing import Rendering, ProcessRendering
@@ -99,7 +99,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
         """Return the names of the cameras that take images: of `all`, those that the vehicle has."""
         wanted, mounts = CAMERAS[self.config.cameras], load_vehicle(self.scenario.vehicle).mounts
         if len(wanted) == 1 and wanted[0] not in mounts:
-            raise ConfigError(f"vehicles/{self.scenario.vehicle}", f"cameras.{wanted[0]}", "missing; it is to take images")
+            raise ConfigError(vehicle_file(self.scenario.vehicle), f"cameras.{wanted[0]}", "missing; it is to take images")
         return tuple(name for name in wanted if name in mounts)
 
     def warm_up(self) -> None:
@@ -223,7 +223,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
         try:
             return getattr(self, f"info_{camera}"), getattr(self, f"image_{camera}")
         except AttributeError:
-            raise ConfigError(f"vehicles/{self.scenario.vehicle}", f"cameras.{camera}",
+            raise ConfigError(vehicle_file(self.scenario.vehicle), f"cameras.{camera}",
                               "is not one of down, front, which are simulated") from None
 
     def _emit_frame(self, name: str, delivery: Delivery) -> Arrival:

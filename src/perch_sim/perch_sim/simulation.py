@@ -19,7 +19,7 @@ import numpy as np
 from perch_core.errors import ConfigError
 from perch_core.surface import PerchSurface
 from perch_core.values import NANOSECONDS, Contact
-from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
+from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle, vehicle_file
 from perch_sim import seeding
 from perch_sim.calibration import true_imu, true_mounts
 from perch_sim.camera_stream import CameraStream
@@ -66,8 +66,8 @@ class Simulation:
         self.scenario = scenario
         self.vehicle: Vehicle = load_vehicle(scenario.vehicle)
         if round(NANOSECONDS / self.vehicle.imu.rate) != CONTROL_PERIOD_NS:
-            raise ConfigError(f"vehicles/{scenario.vehicle}", "imu.rate",
-                              f"{self.vehicle.imu.rate:g} is not the control rate of {NANOSECONDS / CONTROL_PERIOD_NS:g} Hz")
+            raise ConfigError(vehicle_file(scenario.vehicle), "imu.rate",
+                              f"{self.vehicle.imu.rate:g} is not the control rate of {NANOSECONDS / CONTROL_PERIOD_NS:g} Hz, the only one that is simulated")
         self.plant = Plant(scenario, self.vehicle, seed, START)
         self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, MOTOR_TIMEOUT), 0
         self.loop = inner_loop(self.vehicle, scenario.disturbance.loop_lag_factor, scenario.disturbance.voltage_factor)
