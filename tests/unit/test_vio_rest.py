@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from perch_core import so3
@@ -73,6 +74,30 @@ def test_a_camera_that_was_silent_for_longer_than_the_imu_is_kept_is_used_again(
     else:
         np.testing.assert_allclose(after.estimate.p_WB, before.estimate.p_WB, atol=0.01)
         assert sigma[:3].max() < 0.05 and sigma[5] < 0.1
+
+
+@pytest.mark.parametrize("leaves", [False, True])
+def test_a_gap_in_the_imu_at_rest_is_bridged_by_images_that_have_not_moved(leaves):
+    """0.4 s without samples. A vehicle that left meanwhile is seen in the image."""
+    rng, mount, frame = np.random.default_rng(1), load_vehicle("snapdragon").mounts["down"], 0.1
+    vio, seen = VisualInertialOdometry(VioConfig(), mount, np.array([0.5, 0.2, 1.0])), []
+    texture = cv2.GaussianBlur(rng.normal(128, 200, (480, 700)), (0, 0), 3.0)
+    for k in range(1300):
+        t = 0.002 * k
+        if not 1.4 < t < 1.8:
+            vio.add_imu(ImuSample(k * 2 * MS, tuple(rng.normal(0, 0.002, 3)), tuple(rng.normal(0, 0.05, 3) + [0, 0, 9.81])))
+        while frame + 0.02 < t and vio.covers(round(frame * 1e9)):
+            column = round(60.0 * min(max(frame - 1.6, 0.0), 0.6)) if leaves else 0
+            image = np.clip(texture[:, column:column + 640] + rng.normal(0.0, 2.0, (480, 640)), 0, 255).astype(np.uint8)
+            seen.append((frame, vio.add_image(round(frame * 1e9), image)))
+            frame += 1 / 30
+    if leaves:
+        assert any(r.outcome is not FrameOutcome.RESTING for t, r in seen if 1.6 < t < 1.85)
+        return
+    assert {r.outcome for t, r in seen if t > 0.8} == {FrameOutcome.RESTING}
+    last = seen[-1][1].estimate
+    np.testing.assert_allclose(last.p_WB[:2], [0.5, 0.2], atol=0.01)
+    assert np.sqrt(np.diag(last.pose_covariance)).max() < 0.1  # none of it is the 0.6 rad of the gap
 
 
 ATTITUDES = {"ground": np.zeros(3), "wall": np.array([0.1, -1.5, 0.2]), "upside down": np.array([3.0, 0.2, 0.0])}

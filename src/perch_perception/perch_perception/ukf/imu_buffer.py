@@ -59,6 +59,11 @@ class MeasuredNoise:
         self._last = (*self._last[-2:], x)
 
 
+def without_gaps(steps: np.ndarray) -> np.ndarray:
+    """Return the IMU steps (m, 9) that samples measured: without those over a gap in the samples, or at the range of the gyro."""
+    return steps[steps[:, 7] < _GAP_GYRO**2]
+
+
 def is_sane(sample: ImuSample) -> bool:
     """Whether a sample is finite and within the range of any real IMU."""
     (a, b, c), (x, y, z) = sample.w_B, sample.f_B

@@ -14,7 +14,7 @@ from perch_core import so3
 from perch_core.camera import Camera
 from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample, OdometryState
-from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
+from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, without_gaps
 from perch_perception.ukf.odometry import pose_of
 from perch_perception.ukf.stillness import energy, is_at_rest, window
 from perch_perception.ukf.unscented import GYRO
@@ -71,6 +71,7 @@ class VisualInertialOdometry:
         self._known_at: tuple[int, float] | None = None  # stamp of the known pose in motion, and the speed then [ns, m/s]
         self._odometry: deque[OdometryState] | None = deque(maxlen=_KEPT_ODOMETRY)  # of the estimator; None from the first start on
         self._at_rest = False
+        self._noise_factor = 1.0  # variance of the IMU at rest over that of the sensor's noise, as last measured
         self._at_configured_start = True  # the vehicle has not left the configured start
         self._last_visual_update: int | None = None  # when vision last changed the state; None: not since the last rest
         self._frame = 0
@@ -289,14 +290,17 @@ class VisualInertialOdometry:
     def _is_at_rest(self, exposure: int) -> bool:
         """Whether the vehicle rests: the IMU is quiet, nothing moves in the image, and the filter's velocity may be zero.
 
-        False until `_MAX_BLIND_NO_TRACKS` after a visual update: a very quiet hover looks like rest.
+        False until `_MAX_BLIND_NO_TRACKS` after a visual update: a very quiet hover looks like rest. Where IMU samples are missing, a
+        vehicle that rested before rests still if the images since have not moved.
         """
         state = self._running.state
         if self._last_visual_update is not None and exposure - self._last_visual_update < round(1e9 * _MAX_BLIND_NO_TRACKS):
             return False
-        quiet = self._recent_views.is_static()
+        quiet, steps = self._recent_views.is_static(), window(self._imu, exposure)
+        if self._at_rest and quiet and len(without_gaps(steps)) < len(steps):
+            return bool(self._recent_views.is_static(STATIC_DURATION))
         return (quiet is not False and (self._at_rest or rest.velocity_may_be_zero(state))
-                and is_at_rest(window(self._imu, exposure), *_biases(state),
+                and is_at_rest(steps, *_biases(state),
                                image_is_static=bool(quiet) and (self._at_rest or bool(self._recent_views.is_static(STATIC_DURATION)))))
 
     def _hold(self, exposure: int, features: Features) -> VioResult:
@@ -312,15 +316,17 @@ class VisualInertialOdometry:
             rest.stop(filter)
             self._at_rest, self._last_visual_update = True, None
             self._views.clear()
-        steps, noise_factor = self._imu.run(state.stamp, until), max(1.0, energy(window(self._imu, exposure)))
+        steps, latest = self._imu.run(state.stamp, until), window(self._imu, exposure)
+        if len(without_gaps(latest)) == len(latest):
+            self._noise_factor = max(1.0, energy(latest))
         if len(steps):
-            rest.hold(filter, steps, until, noise_factor)
+            rest.hold(filter, steps, until, self._noise_factor)
         self._last_update = exposure
         self._views.append((exposure, features))
         while len(self._views) > 1 and self._views[1][0] <= state.stamp:
             self._views.popleft()
         return self._result(FrameOutcome.RESTING, features, FrameReport(),
-                            rest.propagated_to(filter, self._imu.run(until, exposure, sensor_noise=True), exposure, noise_factor))
+                            rest.propagated_to(filter, self._imu.run(until, exposure, sensor_noise=True), exposure, self._noise_factor))
 
     def _add_ground_landmarks(self, floor: float, features: Features) -> None:
         """Make ground features that were seen at rest, and still are, the first landmarks."""

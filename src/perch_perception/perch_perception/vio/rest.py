@@ -13,6 +13,7 @@ from perch_core import so3
 from perch_core.probability import chi2_quantile
 from perch_core.vehicle import GRAVITY
 
+from perch_perception.ukf.imu_buffer import without_gaps
 from perch_perception.ukf.stillness import REST_VELOCITY
 from perch_perception.ukf.unscented import ACCEL, ACCEL_VARIANCE, DT, GYRO, GYRO_VARIANCE
 from perch_perception.vio import state as at
@@ -43,29 +44,34 @@ def hold(filter: Msckf, steps: np.ndarray, stamp: int, noise_factor: float) -> N
     """Update for a vehicle at rest over IMU steps (m, 9), m > 0, up to their end `stamp` [ns].
 
     w_mean = b_g + n_w,   f_mean = b_a + R^T g + n_f;  the variance of n is `noise_factor` times that of the sensor's noise.
+
+    Over a gap in the samples the vehicle rests unmeasured: only the biases walk.
     """
     s, imu = filter.state, filter.config.imu
-    T = float(steps[:, DT].sum())
+    T, steps = float(steps[:, DT].sum()), without_gaps(steps)
     s.v_WB, s.w_WB_B = np.zeros(3), np.zeros(3)
     s.P[at.VELOCITY, :] = s.P[:, at.VELOCITY] = 0.0
     s.P[at.VELOCITY, at.VELOCITY] = REST_VELOCITY**2 * np.eye(3)
     s.P[_BIASES, _BIASES] += np.repeat([imu.gyro_bias_walk**2 * T, imu.accel_bias_walk**2 * T], 3)
+    s.stamp = stamp
+    if not len(steps):
+        return
     up_B = s.R_WB.T @ np.array([0.0, 0.0, GRAVITY])
     H = np.zeros((6, at.INERTIAL_SIZE))
     H[:3, at.GYRO_BIAS] = H[3:, at.ACCEL_BIAS] = np.eye(3)
     H[3:, at.THETA] = so3.hat(up_B)
     residual = np.concatenate([steps[:, GYRO].mean(axis=0) - s.gyro_bias, steps[:, ACCEL].mean(axis=0) - s.accel_bias - up_B])
-    variance = np.repeat([imu.gyro_noise_density**2, imu.accel_noise_density**2], 3) * noise_factor / T
+    variance = np.repeat([imu.gyro_noise_density**2, imu.accel_noise_density**2], 3) * noise_factor / float(steps[:, DT].sum())
     filter.apply(np.arange(at.INERTIAL_SIZE), H, residual, variance)
-    s.stamp = stamp
 
 
 def propagated_to(filter: Msckf, steps: np.ndarray, stamp: int, noise_factor: float) -> at.State:
     """Return the inertial state propagated to a later stamp [ns] by IMU steps (m, 9) since the filter's; `filter` is unchanged.
 
     These steps contain the beginning of a take-off before it is detected: at its detection, a velocity of zero would be wrong by
-    10 cm/s. `noise_factor` as in `hold`.
+    10 cm/s. Over a gap in the samples it still rests. `noise_factor` as in `hold`.
     """
+    steps = without_gaps(steps)
     n = at.INERTIAL_SIZE
     state = replace(filter.state, stamp=stamp, P=filter.state.P[:n, :n].copy(), clones=[], landmarks={})
     if len(steps):
