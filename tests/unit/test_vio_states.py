@@ -83,7 +83,7 @@ class Flown:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("begin, rate, more", [
-    (0.0, 100.0, {}), (0.0, 1000.0, {}), (1.9, 100.0, {}), (1.9, 1000.0, {}),
+    (0.0, 100.0, {}), (0.0, 1000.0, {}),
     (1.9, 100.0, dict(q_BI=(1.0, 0.0, 0.0, 0.0), gyro_bias=-GYRO_BIAS)),  # forward, right, down
     (1.9, 1000.0, dict(q_BI=(np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0), gyro_bias=np.array([0.0, 0.2, 0.0])))])  # up, right, forward
 def test_large_biases_are_found(begin, rate, more):
