@@ -110,6 +110,7 @@ def main() -> int:
         if not isinstance(mapping, dict) or mapping.get("kind") not in KINDS:
             kind = mapping.get("kind") if isinstance(mapping, dict) else mapping
             raise ConfigError(str(path), "kind", f"{kind!r} is not one of {', '.join(KINDS)}")
+        mapping |= {key: config.beside(path, mapping[key]) for key in {"vehicle"} & set(mapping)}
         _apply(mapping, arguments.set)
         if arguments.animation and mapping["kind"] != "powerline":
             raise ConfigError("--animation", mapping["kind"], "only for powerline")

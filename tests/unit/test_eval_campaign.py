@@ -56,6 +56,19 @@ def test_a_distribution_that_says_nothing_is_refused(entry):
         parse("c.yaml", "vary.a", entry)
 
 
+def test_files_that_a_campaign_names_are_found_beside_it(tmp_path, monkeypatch):
+    folder, elsewhere = tmp_path / "my campaigns", tmp_path / "elsewhere"
+    folder.mkdir(), elsewhere.mkdir()
+    (folder / "wall.yaml").write_text("extends: surface_90\nname: wall\nvehicle: light.yaml\n")
+    for name, mass in (("light", 0.24), ("heavy", 0.26)):
+        (folder / f"{name}.yaml").write_text(f"extends: snapdragon\nmass: {mass}\n")
+    file = write(folder, "name: c\nscenario: wall.yaml\nruns: 1\nvary: {vehicle: {grid: [light.yaml, heavy.yaml, snapdragon]}}\n")
+    monkeypatch.chdir(elsewhere)
+    campaign = load_campaign(file)
+    assert [campaign.mapping(run)["vehicle"] for run in campaign.runs] == [str(folder / "light.yaml"), str(folder / "heavy.yaml"), "snapdragon"]
+    assert [run.values["vehicle"] for run in campaign.runs] == ["light.yaml", "heavy.yaml", "snapdragon"]
+
+
 def test_a_grid_is_gone_through_and_the_rest_drawn(tmp_path):
     campaign = load_campaign(write(tmp_path, """
 name: g

@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 from perch_core import config
 from perch_core.errors import ConfigError
 from perch_planner.planner import plan
@@ -53,6 +54,13 @@ def test_the_script_writes_samples_coefficients_and_a_picture(tmp_path):
     assert np.gradient(z, t)[5:-5] == pytest.approx(vz[5:-5], abs=2e-3)
     assert float(rows[-1]["z"]) == pytest.approx(1.2) and float(rows[-1]["x"]) == pytest.approx(1.66)
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_script_finds_a_vehicle_beside_the_problem(tmp_path):
+    (tmp_path / "heavy.yaml").write_text("extends: snapdragon\nmass: 0.5\n")
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(mapping() | {"vehicle": "heavy.yaml"}))
+    done = call_script("plan.py", str(tmp_path / "mine.yaml"), "--out", str(tmp_path / "never"))
+    assert done.returncode == 2 and f"{tmp_path / 'heavy.yaml'}: speed_max: total thrust 4.50 N cannot lift 0.5 kg" in done.stderr
 
 
 @pytest.mark.parametrize("arguments, code, words", [

@@ -162,3 +162,22 @@ def test_files_that_cannot_be_extended_are_refused_with_their_chain(tmp_path, st
     with pytest.raises(ConfigError) as error:
         load_scenario(tmp_path / f"{start}.yaml")
     assert words.format(tmp_path) in str(error.value)
+
+
+def test_files_that_a_scenario_names_are_found_beside_it_or_in_the_current_folder(tmp_path, monkeypatch):
+    """As those of `extends`, also through a scenario in another folder that extends it."""
+    flights, other, here = (tmp_path / name for name in ("my flights", "other", "here"))
+    for folder in (flights, other, here):
+        folder.mkdir()
+    write(flights, quad="extends: snapdragon\nmass: 0.26\n", pad="pad_size: [0.5, 0.5]\ntags: [{id: 1, centre: [0, 0], size: 0.2}]\n",
+          base="name: base\nvehicle: quad.yaml\ntarget: {board: pad.yaml}\n", far="name: far\nvehicle: far_away.yaml\n")
+    write(other, own="extends: '../my flights/base.yaml'\nname: own\n", quad="extends: snapdragon\nmass: 0.27\n", third="vehicle: quad.yaml\nname: third\n")
+    write(here, quad="extends: snapdragon\nmass: 0.28\n", far_away="extends: snapdragon\n")
+    monkeypatch.chdir(here)
+    for file in ("../my flights/base.yaml", tmp_path / "other" / "own.yaml"):
+        scenario = load_scenario(file)
+        assert (scenario.vehicle, scenario.target.board) == (str(flights / "quad.yaml"), str(flights / "pad.yaml"))
+        assert load_vehicle(scenario.vehicle).mass == 0.26
+    assert load_scenario("../other/third.yaml").vehicle == str(other / "quad.yaml")
+    assert load_scenario(flights / "far.yaml").vehicle == str(here / "far_away.yaml")
+    assert load_scenario("surface_90").vehicle == "snapdragon"

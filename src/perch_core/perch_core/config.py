@@ -259,6 +259,16 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     raise ConfigError(kind, str(name_or_path), f"unknown; there are: {names}")
 
 
+def beside(file: str | Path, name_or_path: Any) -> Any:
+    """Return what a file names: a path, relative to the folder of the file (or, if there is none, to the current one), as an
+    absolute path; a name, and a path to no file, unchanged."""
+    if isinstance(name_or_path, str) and name_or_path.endswith((".yaml", ".yml")):
+        for path in (os.path.join(os.path.dirname(file), name_or_path), name_or_path):
+            if os.path.isfile(path):
+                return os.path.abspath(path)
+    return name_or_path
+
+
 def replace(instance: T, **changes: Any) -> T:
     """`dataclasses.replace` with the range checks of the fields."""
     for item in fields(instance):

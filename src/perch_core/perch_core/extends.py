@@ -12,12 +12,14 @@ from perch_core.errors import ConfigError
 EXTENDS = "extends"
 PARAMETERS = "parameters"  # of nodes, in scenarios
 CHAIN_MAX = 10
+FILES = {"scenarios": ("vehicle", "target.board")}
+"""Folder in `config` -> keys of its files whose values are names or files: paths are relative to the folder of the file that has them."""
 
 
 def extended_mapping(kind: str, name_or_path: str | Path) -> dict[str, Any]:
     """Return the content of a file merged over all files that it extends: mappings key by key, other values replaced.
 
-    Parameters of nodes have dotted names, whichever way the files write them.
+    Parameters of nodes have dotted names, whichever way the files write them. Paths to vehicles and boards are absolute.
 
     Args:
         kind: folder in `config`.
@@ -42,6 +44,13 @@ def _load_merged(kind: str, path: Path, chain: tuple[Path, ...]) -> dict[str, An
     if isinstance(content.get(PARAMETERS), dict):  # dotted or nested: one spelling, so that a file's values replace those of its base
         content[PARAMETERS] = {node: config.flattened(values) if isinstance(values, dict) else values
                                for node, values in content[PARAMETERS].items()}
+    for key in FILES.get(kind, ()):
+        *groups, leaf = key.split(".")
+        place: Any = content
+        for group in groups:
+            place = place.get(group) if isinstance(place, dict) else None
+        if isinstance(place, dict) and leaf in place:
+            place[leaf] = config.beside(path, place[leaf])
     if EXTENDS not in content:
         return content
     base = content.pop(EXTENDS)

@@ -21,7 +21,7 @@ import numpy as np
 from perch_core import config
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError
-from perch_core.extends import extended_mapping
+from perch_core.extends import FILES, extended_mapping
 from perch_core.vehicle import Vehicle
 from perch_eval.campaign.distributions import LARGEST_SEED, Distribution, parse, parse_seed
 from perch_eval.flyable import check_flight, check_names
@@ -70,6 +70,7 @@ class Campaign:
         vary: varied name -> distribution.
         runs: runs to be flown.
         digest: SHA-256 of the settings: engine, runs, and the resolved files of scenario, vehicles and tag boards.
+        file: its file, to whose folder paths are relative.
     """
 
     name: str
@@ -82,12 +83,13 @@ class Campaign:
     vary: dict[str, Distribution]
     runs: tuple[Run, ...]
     digest: str
+    file: Path
 
     def mapping(self, run: Run) -> dict[str, Any]:
         """Return the scenario's mapping for a run, in the form of a scenario file."""
         out = copy.deepcopy(self.base)
         for name, value in run.values.items():
-            set_value(out, name, value)
+            set_value(out, name, config.beside(self.file, value) if name in FILES["scenarios"] else value)
         return out
 
 
@@ -104,7 +106,7 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
     """
     file = config.find("campaigns", path)
     content = config.load(_File, file)
-    base = extended_mapping("scenarios", content.scenario)
+    base = extended_mapping("scenarios", config.beside(file, content.scenario))
     vary = {name: (parse_seed if name == "seed" else parse)(str(file), f"vary.{name}", entry) for name, entry in (content.vary or {}).items()}
     mappable = [name for name in vary if name != "seed"]  # one run a seed: no rate
     for axis in content.map:
@@ -119,7 +121,7 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
     drawn = _draw(vary, runs or content.runs, content.seed)
     axes = content.map or tuple(mappable[:2])
     campaign = Campaign(content.name, content.description, engine, content.sensing, axes if len(axes) == 2 else (),
-                        content.keep_worst, base, vary, drawn, "")
+                        content.keep_worst, base, vary, drawn, "", file)
     named = _check(campaign, str(file))
     settings = json.dumps([engine, asdict(content.sensing), base, [[r.number, r.seed, r.values] for r in drawn], named], sort_keys=True, default=str)
     return replace(campaign, digest=hashlib.sha256(settings.encode()).hexdigest())
