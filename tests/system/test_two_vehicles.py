@@ -1,4 +1,8 @@
-"""Two vehicles in two namespaces of one ROS domain fly at once, each as if it were alone."""
+"""Two vehicles in two namespaces of one ROS domain fly at once, each as if it were alone and without ROS, to the last bit.
+
+One perches on a wall, the other on a cable. No images are rendered, which would take two minutes of processor time for the cable: its
+map is made from the truth, and stays as it is. That engines agree on images is shown in `test_flight_surface.py`.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +15,18 @@ from pathlib import Path
 import pytest
 from perch_eval import modelled_sight_node
 from perch_eval.domain import reserved_domain
-from perch_eval.in_process import fly
+from perch_eval.in_process import FlightTrace, fly
 from perch_eval.mcap_log import read
 from perch_eval.nodes import ALL_NODES, node_programs
 from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.stack import Stack
+from perch_sim.contact_event import ContactState
 from perch_sim.scenario import load_scenario
 from system.scripts import PATIENCE
 
-SCENARIO, LINGER = "surface_90", 0.5
-SEEDS = {"/quad1": 1, "/quad2": 2}
+SEED, LINGER = 1, 0.5
+SCENARIOS = {"/quad1": "surface_90", "/quad2": "line_20"}
 OF_THE_DOMAIN = {"/diagnostics", "/parameter_events", "/rosout"}
 
 
@@ -30,7 +35,8 @@ def vehicle(namespace: str, folder: Path) -> Iterator[tuple[Stack, MissionClient
     """The nodes of a flight without images and with a recorder, in lockstep, and who sends the goal."""
     folder.mkdir()
     overrides = {"mission": {"lockstep_hold": "perch"}, "recorder": {"file": str(folder / "flight.mcap")}}
-    launches = modelled_sight_node.imageless_launches(load_scenario(SCENARIO), SEEDS[namespace], SCENARIO, True, extra=("recorder",), overrides=overrides)
+    name = SCENARIOS[namespace]
+    launches = modelled_sight_node.imageless_launches(load_scenario(name), SEED, name, True, extra=("recorder",), overrides=overrides)
     programs = node_programs(launches, folder, namespace=namespace, composed=set(ALL_NODES) - set(modelled_sight_node.NODES))
     with Stack(modelled_sight_node.imageless_programs(programs), folder) as stack:
         pilot = MissionClient(namespace)
@@ -40,38 +46,55 @@ def vehicle(namespace: str, folder: Path) -> Iterator[tuple[Stack, MissionClient
             pilot.close()
 
 
-def flown(stack: Stack, pilot: MissionClient) -> FlightResult:
-    """From the goal to its end."""
-    result = pilot.fly(load_scenario(SCENARIO), check=stack.raise_if_ended, stall_timeout=PATIENCE)
+def flown(namespace: str, stack: Stack, pilot: MissionClient) -> tuple[FlightResult, set[str]]:
+    """From the goal to its end, and the topics that are there then; nothing flies on while the other one does."""
+    result = pilot.fly(load_scenario(SCENARIOS[namespace]), check=stack.raise_if_ended, stall_timeout=PATIENCE)
     pilot.linger(LINGER, stack.raise_if_ended, PATIENCE)
-    return result
+    topics = {name for name, _ in pilot.node.get_topic_names_and_types()}
+    stack.stop()
+    return result, topics
 
 
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory) -> tuple[dict[str, FlightResult], set[str], Path]:
-    """Result of each vehicle, the topics that were there meanwhile, and the folder of the recordings."""
+    """Result of each vehicle, the topics that were there when the first had flown, and the folder of the recordings."""
     folder = tmp_path_factory.mktemp("two")
     with pytest.MonkeyPatch.context() as patch, reserved_domain() as domain, ExitStack() as running:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
-        both = {namespace: running.enter_context(vehicle(namespace, folder / namespace.strip("/"))) for namespace in SEEDS}
+        both = {namespace: running.enter_context(vehicle(namespace, folder / namespace.strip("/"))) for namespace in SCENARIOS}
         for stack, pilot in both.values():
             stack.wait_until_ready(pilot.visible_nodes, PATIENCE)
         with ThreadPoolExecutor(len(both)) as threads:
-            results = {namespace: threads.submit(flown, *one) for namespace, one in both.items()}
-        topics = {name for name, _ in both["/quad1"][1].node.get_topic_names_and_types()}
-    return {namespace: result.result() for namespace, result in results.items()}, topics, folder
+            results = {namespace: threads.submit(flown, namespace, *one) for namespace, one in both.items()}
+    return {namespace: result.result()[0] for namespace, result in results.items()}, results["/quad1"].result()[1], folder
 
 
-@pytest.mark.parametrize("namespace", SEEDS)
-def test_each_flight_is_the_one_that_it_is_alone(namespace, flights):
+@pytest.fixture(scope="module")
+def alone() -> dict[str, FlightTrace]:
+    """The same flights without ROS."""
+    return {namespace: fly(load_scenario(name), SEED, linger=LINGER) for namespace, name in SCENARIOS.items()}
+
+
+@pytest.mark.parametrize("namespace", SCENARIOS)
+def test_each_flight_is_the_one_that_it_is_alone(namespace, flights, alone):
     results, _, folder = flights
-    alone = fly(load_scenario(SCENARIO), SEEDS[namespace], linger=LINGER)
+    result, trace = results[namespace], alone[namespace]
     recorded = RecordedFlight(folder / namespace.strip("/") / "flight.mcap", namespace)
-    assert results[namespace].outcome == alone.outcome == "perched", results[namespace].message
-    assert recorded.digest(alone.end_time) == alone.flight.digest(alone.end_time)
+    assert (result.outcome, result.message) == (trace.outcome, trace.message)
+    assert result.outcome == "perched"
+    assert recorded.digest(trace.end_time) == trace.flight.digest(trace.end_time)
 
 
-@pytest.mark.parametrize("namespace", SEEDS)
+def test_the_wire_is_gripped_on_a_plan_with_recovery_and_no_other_line_is_touched(flights, alone):
+    _, _, folder = flights
+    recorded, trace = RecordedFlight(folder / "quad2" / "flight.mcap", "/quad2"), alone["/quad2"]
+    plans = [order.id for order in trace.values("trajectory") if order.recovery_start > 0.0]
+    assert plans and [order.id for _, order in recorded.values("trajectory") if order.recovery_start > 0.0] == plans
+    touched = [c for c in trace.contacts if c.body.startswith("cable")]
+    assert [(ContactState(c.state).name, c.body) for c in touched] == [("ATTACHED", "cable 2")]
+
+
+@pytest.mark.parametrize("namespace", SCENARIOS)
 def test_time_and_frames_are_of_each_vehicle(namespace, flights):
     """Nothing is shared but what ROS has once in a domain: neither time, nor transforms, whose frames have the same names."""
     results, topics, folder = flights
