@@ -6,6 +6,7 @@ import io
 import json
 import math
 import re
+import resource
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -207,6 +208,31 @@ def test_mp4_needs_no_other_program(recorded, tmp_path, monkeypatch):
     assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (4, 10)
     found, frame = video.read()
     assert found and np.ptp(frame) > 100  # something is drawn
+
+
+@pytest.mark.parametrize("name", ["f.gif", "f.mp4", "f.png"])
+def test_a_picture_that_cannot_be_written_to_its_end_is_refused_and_the_one_before_is_kept(recorded, tmp_path, capsys, name):
+    """A limit on the size of files stands for a full disk, which OpenCV does not report."""
+    path, _ = recorded
+    options = [str(path), "--from", "1.2", "--to", "1.6", "--fps", "10", "--out", str(tmp_path / name)]
+    (tmp_path / name).write_text("before")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, limits[1]))
+    try:
+        assert main(options) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert f"error: --out: {tmp_path / name}: cannot be written: " in capsys.readouterr().err
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["before"]
+    assert main(options) == 0 and (tmp_path / name).stat().st_size > 3000 and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("option, name", [("--out", "f.gif"), ("--out", "f.mp4"), ("--out", "f.png"), ("--plots", "plots")])
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_drawn(recorded, monkeypatch, capsys, option, name):
+    for drawing in ("write_animation", "stroboscope", "write_plots"):
+        monkeypatch.setattr(command, drawing, lambda *_: pytest.fail("drawn"))
+    assert main([str(recorded[0]), option, f"/proc/{name}"]) == 2
+    assert f"error: {option}: /proc/{name}: cannot be written: No such file or directory" in capsys.readouterr().err
 
 
 def test_the_vehicle_is_that_of_the_recording_or_of_its_report(reported, tmp_path, monkeypatch, capsys):

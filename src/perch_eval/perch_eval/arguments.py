@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import fcntl
 import os
 import socket
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from perch_core.errors import ConfigError, PerchError
@@ -52,7 +54,9 @@ def command(parser: Callable[[], argparse.ArgumentParser], work: Callable[[argpa
         except errors as error:
             if isinstance(error, BrokenPipeError) and discard_closed_output():
                 return 1
-            text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
+            text = str(error)
+            if isinstance(error, OSError) and error.strerror:
+                text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
             print(f"error: {text}", file=sys.stderr)
             return 2
         except KeyboardInterrupt:
@@ -86,6 +90,33 @@ def output_folder(path: Path, option: str = "--out") -> Path:
         raise ConfigError(option, str(path), "another run is writing there: wait for its end, or choose another folder") from None
     except OSError as error:
         raise ConfigError(option, str(path), f"cannot be written: {error.strerror}") from None
+
+
+@contextmanager
+def output_file(path: Path, option: str = "--out") -> Iterator[Path]:
+    """Yield the path of a draft, which replaces the file at the end; after an error or Ctrl-C, the file is as before.
+
+    Args:
+        path: of the file.
+        option: command-line option that names the file, for error messages.
+
+    Raises:
+        ConfigError: the file cannot be written; as far as possible, this is found before the body is run.
+    """
+    draft = path.with_name(f".{os.getpid()}-{path.name}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        yield draft
+        draft.replace(path)
+    except OSError as error:
+        raise ConfigError(option, str(path), f"cannot be written: {error.strerror or error}") from None
+    finally:
+        with suppress(OSError):
+            draft.unlink()
 
 
 def open_network(address: str | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,7 @@ def write_animation(scene: Scene, times: np.ndarray, fps: float, path: Path) -> 
 
     Raises:
         PerchError: OpenCV has no encoder for MP4.
+        OSError: the file could not be written to its end.
     """
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     write(path, fps, with_progress(_frames(scene, times), len(times), unit="frames"))
@@ -135,16 +137,19 @@ def _write_gif(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
 
 
 def _write_mp4(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
-    writer = None
+    writer, count = None, 0
     try:
         for frame in frames:
             height, width = (n - n % 2 for n in frame.shape[:2])  # encoders want even sizes
             if writer is None:
                 writer = _encoder(path, fps, (width, height))
+            count += 1
             writer.write(cv2.cvtColor(frame[:height, :width], cv2.COLOR_RGB2BGR))
     finally:
         if writer is not None:
             writer.release()
+    if int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)) != count:  # OpenCV does not report a full disk
+        raise OSError(errno.EIO, "the video is not complete; is the disk full?")
 
 
 def _encoder(path: Path, fps: float, size: tuple[int, int]) -> cv2.VideoWriter:

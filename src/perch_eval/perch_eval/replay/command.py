@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
-from perch_eval.arguments import command, command_parser, count
+from perch_eval.arguments import command, command_parser, count, output_file, output_folder
 from perch_eval.flight_view import FlightView
 from perch_eval.recorded import identify_vehicle, read_flight, read_report
 from perch_eval.replay.animation import Scene, write_animation
@@ -51,22 +51,25 @@ def _show(args: argparse.Namespace) -> int:
             raise PerchError(f"--{name} {getattr(args, name):g} is not a number > 0")
     if args.out and args.out.suffix.lower() not in (".gif", ".mp4", ".png"):
         raise PerchError(f"{args.out}: the ending is none of .gif, .mp4 and .png")
+    if args.plots:
+        output_folder(args.plots, "--plots")
     flight = read_flight(args.flight, args.namespace)
     path = args.out or Path(flight.source).with_suffix(".gif")
     flight.known_states("ground_truth/odometry")
     vehicle = identify_vehicle(flight, {} if args.vehicle else read_report(flight), args.vehicle)
     view = FlightView.from_flight(flight, vehicle or load_vehicle("snapdragon"))
-    path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".png":
         start, end = span(view, args.start, args.end, 0.0, 0.0)
-        stroboscope(view, start, end, args.instants).savefig(path, dpi=110)
+        with output_file(path) as draft:
+            stroboscope(view, start, end, args.instants).savefig(draft, dpi=110)
         print(f"picture: {path}")
     else:
         start, end = span(view, args.start, args.end)
         step = args.speed / args.fps
         times = start + step * np.arange(max(1, round((end - start) / step)))
-        print(f"{len(times)} frames, {start:.2f} to {end:.2f} s", flush=True)
-        write_animation(Scene(view, start, end), times, args.fps, path)
+        with output_file(path) as draft:
+            print(f"{len(times)} frames, {start:.2f} to {end:.2f} s", flush=True)
+            write_animation(Scene(view, start, end), times, args.fps, draft)
         print(f"animation: {path}")
     if args.plots:
         write_plots(view, args.plots, thrust=vehicle is not None)
@@ -89,7 +92,6 @@ def span(view: FlightView, start: float | None, end: float | None, before: float
 
 def write_plots(view: FlightView, folder: Path, thrust: bool) -> None:
     """Write the figures of the flight's report as PNG files; `thrust`: also that of the thrust, which requires the vehicle."""
-    folder.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Callable[[FlightView], Figure | None]] = {
         "tracking": plots.tracking_figure, "path": plots.path_figure, "rates": plots.rates_figure,
         "estimation_error": plots.error_figure, **({"thrust": plots.thrust_figure} if thrust else {})}
