@@ -266,17 +266,17 @@ def test_a_vehicle_that_stands_still_tells_no_scale():
 @pytest.mark.parametrize("moving", [0.0, 1.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_gyro_bias_is_found_in_motion(seed, moving):
-    """0.2 rad/s in any direction, from a view that moves, or only turns; a tenth of the tracks goes its own way."""
+    """0.2 rad/s in any direction, from a view that moves, or only turns; a tenth or more of the tracks goes its own way."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=3)
     bias, sigma, pairs = 0.2 * direction / np.linalg.norm(direction), 1e-3, []
-    for _ in range(7):
+    for k in range(7):
         X = rng.uniform([-2.0, -2.0, 1.0], [2.0, 2.0, 4.0], (60, 3))
         R, t, dt = so3.exp(rng.normal(0.0, 0.1, 3)), moving * rng.normal(0.0, 0.1, 3), 0.25
         first, second = X + rng.normal(0.0, sigma, X.shape) * X[:, 2:], (X - t) @ R + rng.normal(0.0, sigma, X.shape) * X[:, 2:]
         second[:6] += rng.normal(0.0, 0.5, (6, 3))
         read = R @ so3.exp(bias * dt)  # what the gyro says; a bias that is taken off turns it back
-        pairs.append(RayPair(read, -dt * np.eye(3), *(v / np.linalg.norm(v, axis=1, keepdims=True) for v in (first, second))))
+        pairs.append(RayPair(read, -dt * np.eye(3), *((v / np.linalg.norm(v, axis=1, keepdims=True))[:60 - 3 * k] for v in (first, second))))
     found, P = solve_gyro_bias(pairs, sigma, 0.1)
     assert np.linalg.norm(found - bias) < 0.012
     assert np.sqrt(np.linalg.eigvalsh(P)[-1]) < 0.005
