@@ -34,6 +34,12 @@ if [[ ! "${PERCH_NETWORK:-127.0.0.1}" =~ ^((25[0-5]|2[0-4][0-9]|1?[0-9]?[0-9])(\
   return 1
 fi
 
+if [ -d "$_perch_root/.venv/share/rclpy" ] && [ "${RMW_IMPLEMENTATION:-rmw_fastrtps_cpp}" != rmw_fastrtps_cpp ]; then
+  echo "RMW_IMPLEMENTATION=$RMW_IMPLEMENTATION: the ROS wheels have rmw_fastrtps_cpp only: run   unset RMW_IMPLEMENTATION" >&2
+  _perch_end
+  return 1
+fi
+
 # A workspace that was built with a ROS installation needs it also where it is not sourced yet.
 if [ -z "${ROS_DISTRO:-}" ] && [ -f "$_perch_root/.perch/ros_prefix" ]; then
   source "$(cat "$_perch_root/.perch/ros_prefix")/setup.bash"
@@ -63,8 +69,9 @@ done
 export ROS_DOMAIN_ID="${ROS_DOMAIN_ID:-42}"
 export PERCH_NETWORK="${PERCH_NETWORK:-127.0.0.1}"
 export FASTRTPS_DEFAULT_PROFILES_FILE="${FASTRTPS_DEFAULT_PROFILES_FILE:-$_perch_root/config/fastdds.xml}"
-# With our profile the address is the limit (LOCALHOST would add a socket on every interface); a file of the caller's own may have none.
-if [ "$FASTRTPS_DEFAULT_PROFILES_FILE" = "$_perch_root/config/fastdds.xml" ]; then
+# With our profile the address is the limit (LOCALHOST would add a socket on every interface); a file of the caller's own may have none,
+# and another middleware does not read it.
+if [ "$FASTRTPS_DEFAULT_PROFILES_FILE" = "$_perch_root/config/fastdds.xml" ] && [[ "${RMW_IMPLEMENTATION:-rmw_fastrtps_cpp}" == rmw_fastrtps_* ]]; then
   export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET
 else
   export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"

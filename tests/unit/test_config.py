@@ -122,6 +122,15 @@ def test_unknown_name_lists_the_names_there_are():
         config.find("vehicles", "snapdragoon")
 
 
+def test_another_configuration_folder_without_the_file_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("PERCH_CONFIG_DIR", str(tmp_path))
+    with pytest.raises(ConfigError, match=f"^vehicles: snapdragon: unknown; there are none in {tmp_path}/vehicles$"):
+        config.find("vehicles", "snapdragon")
+    monkeypatch.setenv("PERCH_CONFIG_DIR", str(tmp_path / "gone"))
+    with pytest.raises(ConfigError, match=f"^PERCH_CONFIG_DIR: {tmp_path}/gone: no such folder$"):
+        config.find("vehicles", "snapdragon")
+
+
 def test_replace_checks_ranges():
     with pytest.raises(ConfigError):
         config.replace(Outer(name="a"), count=100)

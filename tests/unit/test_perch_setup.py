@@ -6,6 +6,7 @@ import ctypes
 import importlib
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -167,6 +168,22 @@ def test_a_domain_that_ros_cannot_have_is_refused(monkeypatch, domain):
     with pytest.raises(SetupError, match=f"ROS_DOMAIN_ID={domain} is not a number from 0 to 232") as error:
         variables(WHEELS)
     assert error.value.exit_code == 2
+
+
+@pytest.mark.parametrize("wheels", [True, False])
+@pytest.mark.parametrize("middleware, limit", [("", "SUBNET"), ("rmw_fastrtps_cpp", "SUBNET"), ("rmw_cyclonedds_cpp", "LOCALHOST")])
+def test_another_middleware_is_refused_where_there_is_none_and_else_does_not_search_the_network(tmp_path, wheels, middleware, limit):
+    """The address of `config/fastdds.xml` is a setting of Fast DDS."""
+    shutil.copy(ROOT / "setup.bash", tmp_path)
+    for file in (".venv/bin/activate", "install/setup.bash", *[".venv/share/rclpy/package.xml"] * wheels):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    done = subprocess.run(["bash", "--norc", "-c", 'source "$1/setup.bash" && echo "$ROS_AUTOMATIC_DISCOVERY_RANGE"', "bash", str(tmp_path)],
+                          env={"PATH": os.environ["PATH"], "RMW_IMPLEMENTATION": middleware}, capture_output=True, text=True)
+    if wheels and limit == "LOCALHOST":
+        assert done.returncode == 1 and "the ROS wheels have rmw_fastrtps_cpp only: run   unset RMW_IMPLEMENTATION" in done.stderr
+    else:
+        assert (done.returncode, done.stdout) == (0, f"{limit}\n"), done.stderr
 
 
 # -- the locks -------------------------------------------------------------------------------------------------------

@@ -227,8 +227,10 @@ def flattened(parameters: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
 
 def config_dir() -> Path:
     """Return the folder with `vehicles/`, `scenarios/`, `boards/`: $PERCH_CONFIG_DIR, or that of the checkout or installation."""
-    if os.environ.get("PERCH_CONFIG_DIR"):
-        return Path(os.environ["PERCH_CONFIG_DIR"])
+    if given := os.environ.get("PERCH_CONFIG_DIR"):
+        if not os.path.isdir(given):
+            raise ConfigError("PERCH_CONFIG_DIR", given, "no such folder")
+        return Path(given)
     for folder in Path(__file__).resolve().parents:
         for candidate in (folder / "config", folder / "share" / "perch_core" / "config"):
             if (candidate / "vehicles").is_dir():
@@ -256,7 +258,7 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     if NAME.fullmatch(str(name_or_path)) and candidate.is_file():
         return candidate
     names = ", ".join(sorted(p.stem for p in folder.glob("*.yaml")))
-    raise ConfigError(kind, str(name_or_path), f"unknown; there are: {names}")
+    raise ConfigError(kind, str(name_or_path), f"unknown; there are: {names}" if names else f"unknown; there are none in {folder}")
 
 
 def beside(file: str | Path, name_or_path: Any) -> Any:
