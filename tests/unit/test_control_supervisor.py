@@ -151,6 +151,26 @@ def test_a_recovery_leaves_a_surface_of_any_inclination(inclination):
     assert (loop.plant.p - begin) @ normal > 0.25
 
 
+@pytest.mark.parametrize("inclination, height", [(120.0, 1.1), (135.0, 1.5), (150.0, 1.8)])
+def test_below_an_overhang_a_recovery_does_not_fly_to_the_floor(inclination, height):
+    turn = np.radians(inclination)
+    loop, normal = make_loop(floor=-10.0), np.array([-np.sin(turn), 0.0, np.cos(turn)])
+    loop.begin_in_hover((0.0, 0.0, 3.0))
+    loop.plant.R, contact = so3.exp(np.array([0.0, -turn, 0.0])), loop.plant.p.copy()
+    loop.run(0.002)
+    loop.controller.flight_state = recovered(loop.controller.flight_state._replace(attached_to=tuple(normal)), "for a test")
+    lost, edge = [0.0], []
+
+    def watch(x):
+        lost.append(contact[2] - x.plant.p[2])
+        sine = np.sqrt(max(1 - (x.plant.R[:, 2] @ normal) ** 2, 0.0))
+        edge.append((x.plant.p - contact) @ normal + x.plant.vehicle.perch_offset - max(x.plant.vehicle.body_radii) * sine)
+        return x.controller.state is State.HOVERING
+
+    assert loop.run(3.0, until=watch), loop.events
+    assert max(lost) < height and min(edge) > 0.0, (max(lost), min(edge))
+
+
 def test_attached_stops_the_motors_and_arming_again_recovers():
     plan = perch("surface_90_1.7m")
     loop = hovering(floor=-10.0)

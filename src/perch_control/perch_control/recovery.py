@@ -4,6 +4,8 @@ After a missed perch the vehicle is tilted beside the wall and falls. Turning up
 towards the wall by its radius, so the vehicle pushes off first. It then turns with full moment *and* with high thrust:
 while the thrust points away from the wall, it increases the clearance; in the second half of the turn, it brakes the fall. The
 commanded direction leads the present one by a bounded angle, which keeps most of the thrust while the moment is saturated.
+Below a surface that faces down, the fall itself leads away, and thrust would add to it: there is no push, and while b3 points down
+the thrust is low, but for what the moments need.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ TIMEOUT = 6.0          # a recovery that has not come to rest by then descends [
 _PUSH_TIME = 0.04      # longest push away from the surface [s]
 _PUSH_CLEARANCE = 0.1  # the push ends at this distance from where contact was missed [m]
 _THRUST_SHARE = 0.95   # of the greatest thrust while pushing and turning: the rest is left to the moments
+_DOWN_SHARE = 0.25     # the same while b3 points down
+_OVERHANG = -0.3       # vertical component of the normal of a surface below which there is no push
 _TURN_AHEAD = 50.0     # the commanded direction leads the present one by so much: enough to saturate the moment [deg]
 _AWAY_SPEED = 0.5      # away from the surface until the clearance is reached [m/s]
 _AWAY_DISTANCE = 0.5   # from the surface to the hover: three radii of the smaller vehicle [m]
@@ -58,7 +62,7 @@ class Recovery(ByState):
         """
         self._thrust_max = specific_thrust_max
         self._origin, self._normal = state[0:3], normal
-        self._push = None if normal is None or normal[2] >= cos(radians(30.0)) else normal
+        self._push = normal if normal is not None and _OVERHANG <= normal[2] < cos(radians(30.0)) else None
         _, self._h, _ = axes_of(state[6:10])
         self._setpoint = Setpoint(state[0:3], state[3:6], h=self._h)
         self.finished = False
@@ -87,7 +91,7 @@ class Recovery(ByState):
         f = (side[0], side[1], up + GRAVITY)
         direction = towards(f, b1, b3, radians(_TURN_AHEAD))
         if direction is not None:
-            f = scale(_THRUST_SHARE * self._thrust_max, direction)
+            f = scale((_THRUST_SHARE if b3[2] >= 0.0 else _DOWN_SHARE) * self._thrust_max, direction)
         # Turning upright, the heading can wait: b2 stays where it is.
         h = b2 if b3[2] < 0.5 else horizontal(b2)
         self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=h)
