@@ -57,6 +57,12 @@ def test_where_there_is_none_the_refusal_names_the_limit():
     assert refusal.value.code in ("box", "thrust_floor") and "no way out" in str(refusal.value)
 
 
+def test_at_the_wall_the_refusal_names_the_wall():
+    with pytest.raises(PerchRefusal) as refusal:
+        way_out(PLAN.trajectory.duration - 0.02)
+    assert refusal.value.code == "box" and refusal.value.constraint == "clearance" and refusal.value.margin < 0.0
+
+
 def test_a_plan_is_committed_once_no_way_out_is_left():
     ways = WaysOut(covered=0.0, until=1.0, spacing=0.4)
     assert ways.next(0.2) == 0.4 and ways.next(0.5) == 0.5 and not ways.committed(0.0)

@@ -17,6 +17,7 @@ from perch_core.vehicle import Vehicle
 from perch_planner import refusals
 from perch_planner.certificates import certificates
 from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP, Contact
+from perch_planner.plan_checks import CLEARANCE, HOLDS
 from perch_planner.planner import PerchPlan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings
 from perch_planner.refusals import PerchRefusal
@@ -25,6 +26,7 @@ from perch_planner.search import Outcome, Search
 DURATIONS = (1.2, 0.8, 1.8)  # [s]
 TURN_TIME = 0.3              # of the first piece, where the vehicle turns back [s]
 STANDOFF_MIN = 0.5           # least distance of the hover from the surface's plane when it is reached [m]
+_THROUGH_SURFACE = -1e3      # clearance without which the surface limits no way out [m]
 _CODES = {"body_rate": refusals.BODY_RATE, "thrust": refusals.THRUST_FLOOR, "rotor_thrust": refusals.THRUST_FLOOR}
 
 
@@ -67,20 +69,33 @@ def plan_way_out(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicl
     """
     begin, limits = perf_counter(), Limits.of(settings, vehicle)
     search = Search(problem, replace(settings, objective="jerk"), vehicle, limits)
+    found = _found(search)
+    if found is None or not found.proved:
+        raise _refusal(found, search)
+    trajectory = FlatTrajectory(found.durations, np.concatenate([found.coefficients, found.yaw[:, None]], axis=1))
+    return PerchPlan(trajectory, certificates(found.results, limits, vehicle.mass), search.iterations, perf_counter() - begin,
+                     tuple(search.attempts))
+
+
+def _found(search: Search) -> Outcome | None:
+    """Return the first stop whose limits are proved; where there is none, the last one that was checked."""
     best: Outcome | None = None
     for durations in [(T,) for T in DURATIONS] + [(TURN_TIME, T - TURN_TIME) for T in DURATIONS]:
-        search.contact = _Hover(problem, settings, hover_place(problem, limits, sum(durations)))
+        search.contact = _Hover(search.problem, search.settings, hover_place(search.problem, search.limits, sum(durations)))
         outcome = search.try_durations(np.array(durations))
         if outcome.proved:
-            trajectory = FlatTrajectory(outcome.durations, np.concatenate([outcome.coefficients, outcome.yaw[:, None]], axis=1))
-            return PerchPlan(trajectory, certificates(outcome.results, limits, vehicle.mass), search.iterations, perf_counter() - begin,
-                             tuple(search.attempts))
+            return outcome
         best = outcome if best is None or len(outcome.results) else best
-    raise _refusal(best, search, limits, vehicle.mass)
+    return best
 
 
-def _refusal(best: Outcome | None, search: Search, limits: Limits, mass: float) -> PerchRefusal:
-    """Return the refusal of a way out, with a limit that the last checked stop violates."""
+def _refusal(best: Outcome | None, search: Search) -> PerchRefusal:
+    """Return the refusal of a way out: the surface where there is one without it, otherwise a limit that the last checked stop violates."""
+    settings, limits, mass = replace(search.settings, clearance_min=_THROUGH_SURFACE), search.limits, search.vehicle.mass
+    through = _found(Search(search.problem, settings, search.vehicle, Limits.of(settings, search.vehicle)))
+    if through is not None and through.proved:
+        through.results[CLEARANCE, HOLDS] = 0.0
+        best = through
     if best is None or not len(best.results):
         return PerchRefusal(refusals.THRUST_FLOOR, "thrust range [M:eq16]", -np.inf, "no way out: no stop keeps the thrust within its range",
                             iterations=search.iterations)
