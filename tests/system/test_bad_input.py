@@ -27,7 +27,7 @@ from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from system import forks
-from system.scripts import PATIENCE, run_script
+from system.scripts import PATIENCE
 
 
 BLIND = """
@@ -86,12 +86,13 @@ def test_arguments_of_the_demo(arguments, words, capsys):
     assert words in error and len(error.splitlines()) == 1
 
 
-def test_a_parameter_that_a_node_refuses_is_invalid_input(tmp_path):
+def test_a_parameter_that_a_node_refuses_is_invalid_input(tmp_path, capfd):
     file = tmp_path / "mine.yaml"
     file.write_text(BLIND.replace("{vehicle", "{estimator: {coasting_after: 7000.0}, vehicle"))
-    result = run_script("demo.py", "--scenario", str(file), "--out", str(tmp_path), "--composed", *sorted(set(ALL_NODES) - {"estimator"}))
-    assert result.returncode == 2, result.stderr
-    assert "estimator: coasting_after: 7000 is outside (0, 3600] s" in result.stderr and "Traceback" not in result.stderr
+    code = demo.main(["--scenario", str(file), "--out", str(tmp_path), "--composed", *sorted(set(ALL_NODES) - {"estimator"})])
+    error = capfd.readouterr().err
+    assert code == 2, error
+    assert "estimator: coasting_after: 7000 is outside (0, 3600] s" in error and "Traceback" not in error
 
 
 # -- nodes -----------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def recorded(tmp_path_factory):
     """The file and the flight of its values."""
     from unit.recorded_flights import flown, record
@@ -17,7 +17,7 @@ def recorded(tmp_path_factory):
     return path, Flight(channels)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def reported(recorded, tmp_path_factory):
     """The folder of a flight with its report, and what the report gave."""
     from perch_eval.report import build_report

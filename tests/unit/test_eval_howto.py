@@ -79,8 +79,10 @@ def test_python_runs(text, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
     with patch.dict(LAWS), patch.dict(ESTIMATORS), patch.dict(MISSIONS):  # guides add to them
-        exec(compile(text, guide.name, "exec"), {})
+        exec(compile(text, guide.name, "exec"), space := {})
     assert capsys.readouterr().out.split()[0] in ("perched", "missed")
+    if guide.stem == "own_mission":
+        assert space["trace"].outcome == "perched" and any("going nearer" in message for _, _, message in space["trace"].phases)
 
 
 def test_stacks_that_start_in_the_same_second_have_logs_of_their_own(monkeypatch):

@@ -63,10 +63,10 @@ def straight(start, end, radius: float, colour=BLACK) -> CableCurve:
     return CableCurve(np.array([start, end], dtype=float), radius, colour)
 
 
-@pytest.mark.parametrize("camera", [FISHEYE, PINHOLE], ids=["fisheye", "pinhole"])
-@pytest.mark.parametrize("start, end, radius", [
-    ([4, -4, 2.5], [4, 4, 2.8], 0.03), ([4, -4, 1.4], [5, 4, 1.5], 0.004), ([0.5, -4, 2.1], [0.6, 4, 2.15], 0.03),
-    ([2, 0.3, 0.5], [2, 0.1, 4.5], 0.015)], ids=["far", "thinner than a pixel", "close", "upright"])
+@pytest.mark.parametrize("camera, start, end, radius", [
+    (FISHEYE, [4, -4, 2.5], [4, 4, 2.8], 0.03), (PINHOLE, [4, -4, 2.5], [4, 4, 2.8], 0.03), (PINHOLE, [4, -4, 1.4], [5, 4, 1.5], 0.004),
+    (FISHEYE, [0.5, -4, 2.1], [0.6, 4, 2.15], 0.03), (PINHOLE, [2, 0.3, 0.5], [2, 0.1, 4.5], 0.015)],
+    ids=["far, fisheye", "far, pinhole", "thinner than a pixel, pinhole", "close, fisheye", "upright, pinhole"])
 def test_coverage_is_that_of_brute_force_rays(camera, start, end, radius):
     cable = straight(start, end, radius)
     window = (120, 300, 315, 345) if abs(end[1] - start[1]) > 1 else (200, 225, 220, 330)

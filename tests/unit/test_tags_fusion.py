@@ -86,10 +86,10 @@ def test_covariance_of_one_image_covers_calibration(x):
 
 @pytest.mark.slow
 def test_fusion_stays_consistent_over_a_whole_approach():
-    """NEES of the fused target over 80 flights: shared errors must not be averaged away, as an information filter without them does."""
+    """NEES of the fused target over 40 flights: shared errors must not be averaged away, as an information filter without them does."""
     rng = np.random.default_rng(1)
     values, naive, fused_errors, single_errors, frames = [], [], [], [], 0
-    for _ in range(80):
+    for _ in range(40):
         target, world = None, World(rng)
         information, weighted, (p, R) = np.zeros((6, 6)), np.zeros(6), world.target
         for pose in approach(world):
