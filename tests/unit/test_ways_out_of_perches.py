@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from closed_loop.loop import make_loop, perch
-from perch_control.admission import AtEnd, Order
+from perch_control.admission import AtEnd, Order, check_order
 from perch_control.mission.ways_out import WaysOut
 from perch_control.modes import Command, State
 from perch_control.reference import FlatReference
 from perch_core.surface import PerchSurface
+from perch_core.values import TrajectoryOrder
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.control_flights.aborted import fly_cancelled
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState
@@ -48,6 +49,11 @@ def test_a_way_out_continues_the_plan_keeps_the_limits_and_ends_at_rest_away_fro
         lean = np.linalg.norm(np.cross(force, WALL.normal)) / np.linalg.norm(force)
         assert (x.p - WALL.p_WS) @ WALL.normal >= limits.extension * lean - 1e-6, "the rim stays in front of the wall"
         assert x.p[2] >= limits.height[0] - 1e-9
+
+
+@pytest.mark.parametrize("left", [0.07, 0.08])
+def test_the_controller_accepts_a_way_out_whose_coefficients_are_far_larger_than_its_accelerations(left):
+    check_order(TrajectoryOrder.of(1, way_out(PLAN.trajectory.duration - left).trajectory), VEHICLE)
 
 
 def test_where_there_is_none_the_refusal_names_the_limit():

@@ -18,6 +18,7 @@ START_DELAY_MAX = 0.5   # a trajectory is not flown where its start lies further
 START_GAP = 0.35        # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
 CONTACT_EARLY = 0.15    # a contact may occur so long before the planned one [s]
 _START_SPEED_GAP = 1.0  # the same for the velocity [m/s]
+_PLACES = np.linspace(0.0, 1.0, 21)  # of a segment, where a polynomial is evaluated
 _STEP = 0.02            # largest step inside a trajectory [m]; ten times this for the velocity [m/s]
 
 
@@ -68,13 +69,12 @@ def check_order(order: TrajectoryOrder, vehicle: Vehicle) -> None:
 
 
 def _check_polynomials(trajectory: FlatTrajectory) -> None:
-    """Refuse positions, velocities and accelerations beyond their limits."""
+    """Refuse positions, velocities and accelerations beyond their limits, at `_PLACES`: coefficients may be far larger than values."""
     c, T = trajectory.coefficients, trajectory.durations[:, None, None]
-    _check_size("position", c, limits.POSITION.high)
-    rate = bernstein.derivative(c) / T if trajectory.degree else np.zeros(1)
-    second = bernstein.derivative(rate) / T if trajectory.degree > 1 else np.zeros(1)
-    for name, values, limit in (("velocity", rate, limits.VELOCITY), ("acceleration", second, limits.ACCELERATION)):
-        _check_size(name, values, limit.high)
+    rate = bernstein.derivative(c) / T if trajectory.degree else np.zeros((1, 1))
+    second = bernstein.derivative(rate) / T if trajectory.degree > 1 else np.zeros((1, 1))
+    for name, values, limit in (("position", c, limits.POSITION), ("velocity", rate, limits.VELOCITY), ("acceleration", second, limits.ACCELERATION)):
+        _check_size(name, values @ bernstein.basis(values.shape[-1] - 1, _PLACES).T, limit.high)
 
 
 def _check_samples(trajectory: SampledTrajectory, vehicle: Vehicle) -> None:
