@@ -263,6 +263,11 @@ def test_a_vehicle_that_stands_still_tells_no_scale():
                         np.ones((20, 15), bool), 1e-3, 0.05) == []
 
 
+def test_an_imu_that_reads_zero_is_no_error_of_the_motion_start():
+    (T, dp, dv, by_bias, centres, rays, seen, sigma), _, _ = start_in_motion(6, np.zeros(3))
+    assert all(np.isfinite(found.v).all() for found in solve_motion(T, 0.0 * dp, 0.0 * dv, by_bias, centres, rays, seen, sigma, 0.05))
+
+
 @pytest.mark.parametrize("moving", [0.0, 1.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_gyro_bias_is_found_in_motion(seed, moving):

@@ -12,7 +12,7 @@ from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.vio import FrameOutcome, VioConfig, VisualInertialOdometry
 from perch_perception.vio import state as at
-from perch_perception.vio.divergence import divergence
+from perch_perception.vio.divergence import divergence, velocity_sigma
 from perch_perception.vio.msckf import Msckf
 from perch_perception.vio.start import configured_pose, initial_state
 from perch_perception.vio.tracker import Features, Tracker
@@ -148,6 +148,18 @@ def test_a_filter_that_does_not_fit_what_it_sees_starts_again_and_says_so():
     lost = [r for _, r, _ in out if r.message.startswith("lost:") and r.outcome is FrameOutcome.LOST]
     assert lost and "refused" in lost[0].message and lost[0].estimate is None
     assert out[-1][1].restarts >= 1
+
+
+def test_an_unknown_heading_does_not_end_the_filter():
+    """At 2 m/s it makes the velocity in W unknown, but not that in B."""
+    pose = replace(configured_pose(np.zeros(3), 0.0), covariance=np.diag([0.01, 0.01, 0.01, 3.0]))
+    R_WB, v_WB = so3.exp(np.array([0.1, -0.2, 1.0])), np.array([1.2, -1.6, 0.3])
+    state = initial_state(VioConfig(), MOUNT, 0, R_WB, pose, v_WB, np.zeros(3), 0.01, 0.01, 0.01)
+    turns = -R_WB @ so3.hat(R_WB.T @ v_WB)  # v_W = R v_B: an error of the attitude turns the velocity
+    state.P[at.VELOCITY], state.P[:, at.VELOCITY] = turns @ state.P[at.THETA], state.P[:, at.THETA] @ turns.T
+    state.P[at.VELOCITY, at.VELOCITY] = turns @ state.P[at.THETA, at.THETA] @ turns.T + 0.01 * np.eye(3)
+    assert np.sqrt(np.diag(state.P)[at.VELOCITY].max()) > 2.0 and velocity_sigma(state) == pytest.approx(0.1, rel=0.1)
+    assert divergence(state, 20, 0, 15) == ""
 
 
 @pytest.mark.parametrize("used, refused, lost", [(19, 24, False), (20, 81, True), (0, 21, True), (0, 20, False)])

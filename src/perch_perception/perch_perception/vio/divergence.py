@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from perch_core import so3
 from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS
 from perch_perception.vio import state as at
 
@@ -13,8 +14,13 @@ _MAX_VELOCITY_SIGMA = 1.0  # largest 1 sigma of the velocity [m/s]
 
 
 def velocity_sigma(state: at.State) -> float:
-    """Return 1 sigma of the velocity along its least certain axis of W [m/s]."""
-    return float(np.sqrt(np.diag(state.P)[at.VELOCITY].max()))
+    """Return 1 sigma of the velocity along its least certain axis of B [m/s].
+
+    Of B, not of W: an unknown heading turns the velocity in W, without harm to the filter. v_B = R^T v, dv_B = R^T dv + [v_B]x theta.
+    """
+    J = np.hstack([so3.hat(state.R_WB.T @ state.v_WB), state.R_WB.T])
+    rows = np.r_[at.THETA, at.VELOCITY]
+    return float(np.sqrt(np.diag(J @ state.P[np.ix_(rows, rows)] @ J.T).max()))
 
 
 def divergence(state: at.State, used: int, refused: int, frames: int) -> str:

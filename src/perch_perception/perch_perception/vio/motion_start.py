@@ -88,9 +88,10 @@ def solve_motion(T: np.ndarray, dp: np.ndarray, dv: np.ndarray, by_bias: np.ndar
         Solutions, the most likely first; none where the motion does not determine velocity and gravity.
     """
     G = np.concatenate([T[:, None, None] * np.eye(3), 0.5 * T[:, None, None] ** 2 * np.eye(3), by_bias], axis=2)
-    along = dv * (-GRAVITY / max(float(np.linalg.norm(dv)), 1e-9))
-    found = [_refined(G, dp + centres, rays, seen, sigma, bias_sigma, *begin)
-             for begin in ((None, 1.0), (along, 1.0), (along, 3.0), (along, 10.0))]
+    begins: list[tuple[np.ndarray | None, float]] = [(None, 1.0)]
+    if (gained := float(np.linalg.norm(dv))) > 1e-6:  # zero in free fall, or from an IMU that reads zero
+        begins += [(dv * (-GRAVITY / gained), scale) for scale in (1.0, 3.0, 10.0)]
+    found = [_refined(G, dp + centres, rays, seen, sigma, bias_sigma, *begin) for begin in begins]
     distinct: list[MotionSolution] = []
     for _, end in sorted((end for end in found if end is not None), key=lambda end: end[0]):
         if not any(np.linalg.norm(end.g - other.g) < 0.5 and np.linalg.norm(end.v - other.v) < 0.2 * np.linalg.norm(other.v) for other in distinct):
