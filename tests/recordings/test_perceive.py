@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from itertools import islice
 
 import cv2
 import numpy as np
@@ -68,13 +67,16 @@ def test_biases_within_what_is_declared_are_no_warning(euroc):
     assert levels["accel bias of VIO"] == levels["gyro bias of VIO"] == "ok"
 
 
-def test_an_accelerometers_bias_beyond_the_sensor_file_is_to_be_declared(files, tmp_path, capsys):
+def test_an_accelerometers_bias_beyond_the_sensor_file_is_to_be_declared_and_a_truth_on_another_clock_is_not_compared(files, tmp_path, capsys):
     """0.1 m/s^2 along gravity, where 0.01 is declared."""
+    (tmp_path / "far.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
     mine = yaml.safe_load((files / "mine.yaml").read_text())
     mine["imu"]["accel_bias"] = 0.01
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(mine))
-    assert perceive(files / "mcap", "--sensors", tmp_path / "mine.yaml", "--out", tmp_path, "--without", "target_localizer", "powerline_mapper") == 0
+    assert perceive(files / "mcap", "--sensors", tmp_path / "mine.yaml", "--truth", tmp_path / "far.tum", "--out", tmp_path,
+                    "--without", "target_localizer", "powerline_mapper") == 0
     assert "warning: accel bias of VIO: " in (said := capsys.readouterr().out) and "declare accel_bias in the sensor file" in said
+    assert "not compared: the truth" in said and "path_m" in report(tmp_path)["vio"]
 
 
 def test_the_page_shows_it(euroc):
@@ -124,14 +126,6 @@ def test_topics_that_the_recording_lacks_are_those_of_the_nodes(files):
                          (replace(sensors, imu=replace(sensors.imu, topic="/x")), r"no IMU on /x \(`topic` of the IMU")):
         with pytest.raises(RecordingError, match=words):
             BagRecording(files / "mcap", other)
-
-
-def test_a_truth_on_another_clock_costs_the_comparison_alone(files, tmp_path, capsys, monkeypatch):
-    (tmp_path / "far.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
-    events = AslRecording.events
-    monkeypatch.setattr(AslRecording, "events", lambda self: islice(events(self), 700))
-    assert perceive(files / "asl", "--truth", tmp_path / "far.tum", "--out", tmp_path / "out", "--without", "target_localizer", "powerline_mapper") == 0
-    assert "not compared: the truth" in capsys.readouterr().out and "path_m" in report(tmp_path / "out")["vio"]
 
 
 def test_truth_of_markers_is_taken_to_the_imu(files, tmp_path):
