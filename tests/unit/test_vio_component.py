@@ -206,10 +206,10 @@ TURN, SHIFT = so3.exp(np.array([0.0, 0.0, 0.7])), np.array([5.0, -3.0, 20.0])
 POSE_SIGMA = np.array([0.3, 0.2, 0.1, 0.01, 0.01, 0.05])
 
 
-def elsewhere(stamp, truth):
+def elsewhere(stamp, p_WB, v_WB, R_WB):
     """Odometry of an estimator for which the vehicle is at another place, with another heading."""
-    q = tuple(so3.quat_from_matrix(TURN @ truth.R_WB[0]))
-    return OdometryState(stamp, tuple(TURN @ truth.p_WB[0] + SHIFT), q, tuple(truth.R_WB[0].T @ truth.v_WB[0]), (0.0, 0.0, 0.0),
+    q = tuple(so3.quat_from_matrix(TURN @ R_WB))
+    return OdometryState(stamp, tuple(TURN @ p_WB + SHIFT), q, tuple(R_WB.T @ v_WB), (0.0, 0.0, 0.0),
                          np.diag(POSE_SIGMA**2), 0.01 * np.eye(6), "map")
 
 
@@ -218,8 +218,10 @@ def joined(begin, until, tamper=lambda flight, odometry: odometry):
     flight = Flight()
     flight.samples = [sample for sample in flight.samples if sample.stamp >= begin * 1e9]
     flight.waiting = [frame for frame in flight.waiting if frame[0] >= begin * 1e9]
-    for stamp in [sample.stamp for sample in flight.samples if sample.stamp < until * 1e9]:
-        odometry = elsewhere(stamp, flight.motion.sample(np.array([stamp * 1e-9])))
+    stamps = [sample.stamp for sample in flight.samples if sample.stamp < until * 1e9]
+    truth = flight.motion.sample(np.array(stamps) * 1e-9)
+    for stamp, *moved in zip(stamps, truth.p_WB, truth.v_WB, truth.R_WB):
+        odometry = elsewhere(stamp, *moved)
         flight.component.on_estimate(tamper(flight, odometry))
         flight.fly((stamp + 1) * 1e-9)
     return flight
