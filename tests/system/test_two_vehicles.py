@@ -13,9 +13,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from closed_loop.perched import SEEDS, Perched, perched
 from perch_eval import modelled_sight_node
 from perch_eval.domain import reserved_domain
-from perch_eval.in_process import FlightTrace, fly
+from perch_eval.goal import outcome_of
 from perch_eval.mcap_log import read
 from perch_eval.nodes import ALL_NODES, node_programs
 from perch_eval.ros.mission_client import FlightResult, MissionClient
@@ -25,8 +26,8 @@ from perch_sim.contact_event import ContactState
 from perch_sim.scenario import load_scenario
 from system.scripts import PATIENCE
 
-SEED, LINGER = 1, 0.5
-SCENARIOS = {"/quad1": "surface_90", "/quad2": "line_20"}
+LINGER = 0.5
+SCENARIOS = {"/quad1": "surface_90", "/quad2": "line_80"}
 OF_THE_DOMAIN = {"/diagnostics", "/parameter_events", "/rosout"}
 
 
@@ -36,7 +37,7 @@ def vehicle(namespace: str, folder: Path) -> Iterator[tuple[Stack, MissionClient
     folder.mkdir()
     overrides = {"mission": {"lockstep_hold": "perch"}, "recorder": {"file": str(folder / "flight.mcap")}}
     name = SCENARIOS[namespace]
-    launches = modelled_sight_node.imageless_launches(load_scenario(name), SEED, name, True, extra=("recorder",), overrides=overrides)
+    launches = modelled_sight_node.imageless_launches(load_scenario(name), SEEDS[name], name, True, extra=("recorder",), overrides=overrides)
     programs = node_programs(launches, folder, namespace=namespace, composed=set(ALL_NODES) - set(modelled_sight_node.NODES))
     with Stack(modelled_sight_node.imageless_programs(programs), folder) as stack:
         pilot = MissionClient(namespace)
@@ -70,28 +71,28 @@ def flights(tmp_path_factory) -> tuple[dict[str, FlightResult], set[str], Path]:
 
 
 @pytest.fixture(scope="module")
-def alone() -> dict[str, FlightTrace]:
+def alone() -> dict[str, Perched]:
     """The same flights without ROS."""
-    return {namespace: fly(load_scenario(name), SEED, linger=LINGER) for namespace, name in SCENARIOS.items()}
+    return {namespace: perched(name) for namespace, name in SCENARIOS.items()}
 
 
 @pytest.mark.parametrize("namespace", SCENARIOS)
 def test_each_flight_is_the_one_that_it_is_alone(namespace, flights, alone):
     results, _, folder = flights
-    result, trace = results[namespace], alone[namespace]
+    result, other = results[namespace], alone[namespace]
     recorded = RecordedFlight(folder / namespace.strip("/") / "flight.mcap", namespace)
-    assert (result.outcome, result.message) == (trace.outcome, trace.message)
-    assert result.outcome == "perched"
-    assert recorded.digest(trace.end_time) == trace.flight.digest(trace.end_time)
+    assert result.outcome == outcome_of(other.result.error_code, load_scenario(SCENARIOS[namespace])) == "perched", result.message
+    assert result.message == other.result.message
+    assert recorded.digest(other.time) == other.digest
 
 
 def test_the_wire_is_gripped_on_a_plan_with_recovery_and_no_other_line_is_touched(flights, alone):
     _, _, folder = flights
-    recorded, trace = RecordedFlight(folder / "quad2" / "flight.mcap", "/quad2"), alone["/quad2"]
-    plans = [order.id for order in trace.values("trajectory") if order.recovery_start > 0.0]
+    recorded, other = RecordedFlight(folder / "quad2" / "flight.mcap", "/quad2"), alone["/quad2"]
+    plans = [order.id for order in other.plans if order.recovery_start > 0.0]
     assert plans and [order.id for _, order in recorded.values("trajectory") if order.recovery_start > 0.0] == plans
-    touched = [c for c in trace.contacts if c.body.startswith("cable")]
-    assert [(ContactState(c.state).name, c.body) for c in touched] == [("ATTACHED", "cable 2")]
+    touched = [c for c in other.contacts if c.body.startswith("cable")]
+    assert [(ContactState(c.state).name, c.body) for c in touched] == [("ATTACHED", "cable 0")], "that of the perch point"
 
 
 @pytest.mark.parametrize("namespace", SCENARIOS)

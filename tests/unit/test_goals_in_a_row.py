@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
+from closed_loop.perched import perched
 from perch_control.maneuvers import recovered
 from perch_control.modes import State
 from perch_core.values import ImuSample, TriggerRequest
@@ -25,17 +25,6 @@ def ended(loop, goal, limit=40.0):
         loop.step()
     assert sent.result is not None, loop.trace.phases[-3:]
     return sent.result
-
-
-SEEDS = {"surface_90": 1, "line_80": 2}  # with seed 1 the gripper misses the wire at the second perch
-
-
-@cache
-def perched(name):
-    """A run after its first goal, which one test may go on with, the goal's result, and the digest of the flight so far."""
-    loop = arrange(load_scenario(name), SEEDS[name])
-    result = ended(loop, goal_of(load_scenario(name)), 60.0)
-    return loop, result, loop.trace.flight.digest(loop.time)
 
 
 def test_a_goal_sent_again_in_the_air_does_not_climb():
@@ -56,7 +45,8 @@ def test_perch_depart_and_perch_again(name):
 
     The second contact the controller takes for a miss, and pushes off, against velcro or gripper that hold: a perch all the same.
     """
-    goal, (loop, result, _) = goal_of(load_scenario(name)), perched(name)
+    goal, first = goal_of(load_scenario(name)), perched(name)
+    loop, result = first.loop, first.result
     flight, plant = loop.components["controller"].flight, loop.vehicle.simulation.plant
     for given_up in (False, True):
         if given_up:
@@ -103,5 +93,5 @@ def test_another_writers_bad_imu_samples_leave_no_trace_of_themselves():
             for name in ("estimator", "controller", "mission"):
                 loop.components[name].on_imu(ImuSample(stamp + (2_000_000, 1_000_000, 0)[steps % 3], (math.nan,) * 3, (0.0, 0.0, math.inf)))
     assert sent.result is not None and sent.result.success
-    assert loop.trace.flight.digest(loop.time) == perched("surface_90")[2]
+    assert loop.trace.flight.digest(loop.time) == perched("surface_90").digest
     loop.close()
