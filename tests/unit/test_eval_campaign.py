@@ -69,6 +69,19 @@ def test_files_that_a_campaign_names_are_found_beside_it(tmp_path, monkeypatch):
     assert [run.values["vehicle"] for run in campaign.runs] == ["light.yaml", "heavy.yaml", "snapdragon"]
 
 
+@pytest.mark.parametrize("vary, vehicle", [("wind.gust_sigma: {grid: [0.1]}", "rpg"), ("vehicle: {grid: [rpg, snapdragon]}", None)])
+def test_the_report_names_scenario_vehicle_and_code(tmp_path, monkeypatch, vary, vehicle):
+    from perch_eval.campaign import report
+
+    monkeypatch.setattr(report, "code_version", lambda: {"commit": "1234567+", "digest": "abc"})
+    (tmp_path / "wall.yaml").write_text("extends: surface_60\nname: my wall\nvehicle: rpg\n")
+    page = report.write_report(load_campaign(write(tmp_path, f"name: c\nscenario: wall.yaml\nruns: 1\nvary: {{{vary}}}\n")), [], tmp_path).read_text()
+    for row in ("<th>scenario</th><td>my wall</td>", "<th>commit</th><td>1234567+ (digest abc)</td>"):
+        assert row in page
+    assert (f"<th>vehicle</th><td>{vehicle}</td>" if vehicle else "<th>varied</th><td>vehicle: grid") in page
+    assert page.count("<th>vehicle</th>") == bool(vehicle)
+
+
 def test_a_grid_is_gone_through_and_the_rest_drawn(tmp_path):
     campaign = load_campaign(write(tmp_path, """
 name: g

@@ -103,7 +103,8 @@ def test_a_report_is_written(recorded, reported):
     for words in ("mission commands arm: take-off", "trajectory 1 (perch) starts, takes 2.00 s", "attached to pad",
                   "front camera, 1.00 to 3.80 s", "data:image/webp"):
         assert words in page
-    for row in ("<th>vehicle</th><td>snapdragon</td>", f"<th>date</th><td>{written['date']}</td>", f"<th>commit</th><td>{written['commit']} (digest {written['digest']})</td>",
+    for row in ("<th>vehicle</th><td>snapdragon</td>",
+                f"<th>date</th><td>{written['date']}</td>", f"<th>commit</th><td>{written['commit']} (digest {written['digest']})</td>",
                 "<td>0.7 m/s (0.2 to 1 m/s): +0.3 m/s left</td>"):
         assert row in page
     reported_at = datetime.strptime(written["date"], "%Y-%m-%d %H:%M UTC").replace(tzinfo=UTC)

@@ -178,7 +178,8 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
     timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
                for node, values in report["timings_ms"].items()]
     margin_rows = [(m["name"], margin_text(m)) for m in report["margins"]]
-    flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("seed", report["seed"]), ("date", report["date"]),
+    flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("vehicle", report["vehicle"]), ("seed", report["seed"]),
+             ("date", report["date"]),
              ("commit", report["commit"] + (f" (digest {report['digest']})" if report["digest"] else "")),
              ("made by", f"{report['command']} on {report['machine']}")]
     return page(

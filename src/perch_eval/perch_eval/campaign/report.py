@@ -12,7 +12,9 @@ from perch_eval.campaign.results import RunResult, flight_folder, worst
 from perch_eval.campaign.specification import Campaign, values_text
 from perch_eval.metrics import FIGURES
 from perch_eval.page import Html, image, page, section, table, text
+from perch_eval.revision import code_version
 from perch_eval.statistics import Rate, Spread
+from perch_sim.scenario import Scenario
 
 METRICS = {name: (f"{FIGURES[name][0]} [{FIGURES[name][1]}]", FIGURES[name][2]) for name in (
     "contact_normal_speed_m_s", "contact_tangential_speed_m_s", "contact_tilt_error_deg", "contact_offset_m", "target_error_position_m",
@@ -45,8 +47,10 @@ def _page(campaign: Campaign, found: Sequence[RunResult], folder: Path) -> str:
 
 
 def _facts(campaign: Campaign, found: Sequence[RunResult], rate: Rate) -> str:
-    wall = sum(r.wall_time for r in found)
+    wall, code = sum(r.wall_time for r in found), code_version()
     return table([
+        ("scenario", campaign.base["name"]), *[("vehicle", campaign.base.get("vehicle", Scenario.vehicle))] * ("vehicle" not in campaign.vary),
+        ("commit", code["commit"] + (f" (digest {code['digest']})" if code["digest"] else "")),
         ("successes", f"{rate} (95 % Wilson interval)"), ("flown", f"{len(found)} of {len(campaign.runs)} runs"),
         ("engine", campaign.engine + (f", cameras: vio {campaign.sensing.vio}, target {campaign.sensing.target}"
                                       if campaign.engine == "in_process" else "")),
