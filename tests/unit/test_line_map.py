@@ -281,3 +281,14 @@ def test_wires_move_along_with_what_the_odometry_corrects_its_position_by(speed,
     np.testing.assert_allclose(poses.at(3.0).corrected, share * correction, atol=5e-3)
     np.testing.assert_allclose(after.centre - before.centre, poses.at(3.0).corrected, atol=1e-3)
     assert before.distance(wire.point) < 0.02
+
+
+@pytest.mark.parametrize("sag", [0.039, 0.155])
+def test_the_chords_of_a_sagging_wire_stay_within_two_centimetres_of_it(sag):
+    rng, wire, mapper = np.random.default_rng(1), WireCurve(WIRE.point, WIRE.direction, sag / 2.0), LineMapper()  # over 4 m
+    for k in range(12):
+        p = np.array([0.0, 0.0, 1.6 + 0.1 * k])
+        body = BodyState(0.1 * k, p, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), 1e-8 * np.eye(6))
+        lines = mapper.update(body.time, body, [observe(rng, wire, p, time=body.time, radius=0.03)]).lines
+    points = wire.at(np.linspace(-1.99, 1.99, 300))
+    assert lines and np.max(np.min([line.segment.distance(points) for line in lines], axis=0)) < 0.021

@@ -196,7 +196,7 @@ class LineMapper:
         low, high = track.extent
         length = high - low
         sag = abs(estimate.curve.curvature) * length**2 / 8.0
-        # chords of a parabola leave it by their share of its sag; half of it once they are moved to its middle
+        # a chord is as far from its parabola as that sags below it; half of that once it is moved by half the sag
         pieces = max(1, int(np.ceil(np.sqrt(sag / (2.0 * STRAIGHTNESS)))))
         radius = float(estimate.radius) if np.isfinite(estimate.radius) else self.settings.triangulation.radius
         lines = []
@@ -229,8 +229,8 @@ class LineMapper:
 
 
 def _chord(curve: WireCurve, a: float, b: float, radius: float, offset: np.ndarray) -> Segment:
-    """Return the segment nearest to the wire between a and b: its chord, moved by two thirds of the sag and `offset` (3,) [m]."""
-    lift = -curve.curvature * (b - a) ** 2 / 12.0  # mean of the parabola below its chord
+    """Return the segment nearest to the wire between a and b: its chord, moved by half of the sag and `offset` (3,) [m]."""
+    lift = -curve.curvature * (b - a) ** 2 / 16.0
     shift = lift * curve.axes[:, 1] + offset
     return Segment.between(curve.at(a) + shift, curve.at(b) + shift, radius)
 
