@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+import shutil
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,6 +75,35 @@ def test_words_do_not_change_the_digest_and_figures_do(tmp_path, monkeypatch):
     assert first != written('"""Rates."""\n\nRATE = """[Hz]"""\n\n\ndef f():\n    """Says "hello"."""\n')
 
 
+@pytest.mark.skipif(not revision._git("rev-parse", "HEAD"), reason="not in a git repository")
+def test_the_digest_without_git_is_that_of_the_same_files_with_it(tmp_path, monkeypatch):
+    for name in revision._git("ls-files", *revision.CODE).splitlines():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(revision.root() / name, tmp_path / name, follow_symlinks=False)
+    now = revision.digest()
+    cache = tmp_path / "src" / "perch_core" / "perch_core" / "__pycache__" / "so3.nbi"
+    cache.parent.mkdir()
+    cache.touch()
+    monkeypatch.setattr(revision, "root", lambda: tmp_path)
+    monkeypatch.setenv("PERCH_CONFIG_DIR", str(tmp_path / "config"))
+    assert (revision.commit(), revision.digest()) == ("unknown", now)
+    (tmp_path / "src" / "perch_core" / "perch_core" / "so3.py").write_text("")
+    assert revision.digest() != now
+
+
+def test_another_configuration_is_part_of_the_code_and_its_repository_is_not_ours(tmp_path, monkeypatch):
+    ours, ours_digest = revision.commit(), revision.digest()
+    shutil.copytree(revision.config_dir(), tmp_path / "config")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    for command in (["init", "-q"], ["add", "config"], ["commit", "-q", "-m", "mine"]):
+        subprocess.run([*git, *command], check=True)
+    monkeypatch.setenv("PERCH_CONFIG_DIR", str(tmp_path / "config"))
+    assert revision.commit() in ("unknown", ours.rstrip("+") + "+")
+    digest = revision.digest()
+    (tmp_path / "config" / "vio.yaml").write_text("")
+    assert len({ours_digest, digest, revision.digest()}) == 3
+
+
 def test_a_page_is_marked_once_the_code_has_changed(tmp_path, monkeypatch):
     monkeypatch.setattr(revision, "digest", lambda: "0123456789ab")
     page = tmp_path / "page.md"
@@ -115,7 +145,7 @@ def test_the_changes_of_several_commits_are_since_the_oldest():
 
 def test_code_is_of_unknown_version_without_git(monkeypatch):
     monkeypatch.setenv("PATH", "/nonexistent")
-    assert revision.code_version() == {"commit": "unknown", "digest": ""}
+    assert revision.commit() == "unknown" and re.fullmatch("[0-9a-f]{12}", revision.digest())
 
 
 def test_the_front_page_shows_what_the_pages_of_results_say():

@@ -23,7 +23,10 @@ _DOCSTRING = re.compile(rb'^([ \t]*)"""(?![),])(?:[^"\\]|\\.|"(?!""))*"""[ \t]*$
 
 
 def root() -> Path:
-    """The checkout that this code runs from."""
+    """The checkout that this code runs from, whatever PERCH_CONFIG_DIR is."""
+    for folder in Path(__file__).resolve().parents:
+        if (folder / "config" / "vehicles").is_dir():
+            return folder
     return config_dir().resolve().parent
 
 
@@ -36,9 +39,22 @@ def _git(*arguments: str) -> str:
 
 
 def commit() -> str:
-    """Return the commit of the code, with a plus sign if the sources have changed since; `unknown` outside a repository."""
+    """Return the commit of the code, with a plus sign if the sources have changed since or PERCH_CONFIG_DIR replaces some of them;
+    `unknown` outside a repository."""
     found = _git("rev-parse", "--short=7", "HEAD")
-    return found + "+" * bool(_git("status", "--porcelain", "--untracked-files=no", *CODE)) if found else "unknown"
+    return found + "+" * bool(_git("status", "--porcelain", "--untracked-files=no", *CODE) or _other_config()) if found else "unknown"
+
+
+def _other_config() -> Path | None:
+    """Return the configuration folder if it is not that of the checkout."""
+    folder = config_dir().resolve()
+    return None if folder == root() / "config" else folder
+
+
+def _walked(*folders: Path) -> list[Path]:
+    """Return the files in some folders, without hidden ones and those that Python writes."""
+    found = [(path, path.relative_to(folder).parts) for folder in folders for path in folder.rglob("*") if path.is_file() or path.is_symlink()]
+    return [path for path, parts in found if not any(part.startswith(".") or part == "__pycache__" or part.endswith(".egg-info") for part in parts)]
 
 
 def without_docstrings(source: bytes) -> bytes:
@@ -47,13 +63,14 @@ def without_docstrings(source: bytes) -> bytes:
 
 
 def digest() -> str:
-    """SHA-256 over all files of `CODE` that git tracks, as they are in the working tree, 12 digits; empty outside a repository.
+    """SHA-256 over all files of `CODE` that git tracks (outside a repository, or without git: all), as they are in the working
+    tree, 12 digits; with PERCH_CONFIG_DIR also over those there.
 
     Docstrings do not count: rewording them does not invalidate results.
     """
-    total, folder = hashlib.sha256(), root()
-    names = _git("ls-files", *CODE).splitlines()
-    for name in names:
+    total, folder, other = hashlib.sha256(), root(), _other_config()
+    names = _git("ls-files", *CODE).splitlines() or [path.relative_to(folder).as_posix() for path in _walked(*(folder / part for part in CODE))]
+    for name in sorted([*names, *(str(path) for path in _walked(*([other] if other else [])))]):
         path = folder / name
         content = path.read_bytes() if path.is_file() else b""
         total.update(name.encode() + b"\0" + (without_docstrings(content) if path.suffix == ".py" else content) + b"\0")
