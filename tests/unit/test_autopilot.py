@@ -23,7 +23,7 @@ from perch_autopilot.watchdog import CENTRED, OFF, ON, Mode, Watchdog
 from perch_autopilot.link import LinkError
 from perch_core.config import config_dir
 from perch_core.errors import ConfigError
-from perch_core.values import RatesThrust
+from perch_core.values import NANOSECONDS, ControllerCommand, RatesThrust
 from perch_core.vehicle import Battery, load_vehicle
 from scipy.spatial.transform import Rotation
 
@@ -182,6 +182,9 @@ class StubAutopilot:
 
     def report_motors_turning(self) -> None:
         self.told.append("turning")
+
+    def kill(self) -> None:
+        self.told.append("kill")
 
     def set_throttles(self, hover: int, descent: int) -> None:
         self.throttles = hover, descent
@@ -441,6 +444,28 @@ def test_a_controller_that_is_started_again_in_flight_does_not_stop_the_motors()
     dog.command(4.2, False, CENTRED)                            # the descent has ended: it may arm again
     dog.command(4.3, True, STICKS)
     assert dog.channels(4.3)[4] == ON
+
+
+@pytest.mark.parametrize("age", [0.01, 0.2, 1.0])
+def test_kill_stops_the_motors_also_in_a_descent_without_commands(age):
+    dog = watchdog()
+    dog.command(0.0, True, STICKS)
+    assert dog.channels(age)[4] == ON
+    dog.kill()
+    assert dog.channels(age)[4] == OFF
+    dog.command(age + 0.1, True, STICKS)
+    assert dog.channels(age + 0.1)[4] == OFF
+    dog.command(age + 0.2, False, CENTRED)
+    dog.command(age + 0.3, True, STICKS)
+    assert dog.channels(age + 0.3)[4] == ON
+
+
+@pytest.mark.parametrize("command, stamp, killed", [(5, 0, True), (5, 9 * NANOSECONDS, True), (5, NANOSECONDS, False), (3, 0, False)])
+def test_the_node_itself_obeys_a_kill_that_is_current(command, stamp, killed, flown_on):
+    node = flown_on(16.0)
+    node.on_poll(9 * NANOSECONDS + 1)
+    node.on_command(ControllerCommand(stamp, command, "by hand"))
+    assert ("kill" in node._link.told) is killed
 
 
 def test_a_clock_that_jumps_back_turns_the_motors_off():

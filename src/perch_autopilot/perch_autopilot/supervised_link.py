@@ -5,7 +5,7 @@ a fixed rate from the first command on; without fresh commands the `Watchdog` de
 ended and the autopilot has received commands to stop the motors; if the link is lost then, it waits for it for a minute.
 
     node -> supervisor   b"C" armed, 4 channels: a command       b"R" bytes: a request for the autopilot       b"H" hover, descent: throttles
-                         b"T": the motors turn already
+                         b"T": the motors turn already                       b"K": stop the motors
     supervisor -> node   b"D" bytes: from the autopilot          b"M" text: the watchdog's mode, or an error
 """
 
@@ -126,6 +126,8 @@ class LinkSupervisor:
             self._watchdog.set_throttles(*THROTTLES.unpack_from(packet, 1))
         elif packet == b"T":
             self._watchdog.report_motors_turning()
+        elif packet == b"K":
+            self._watchdog.kill()
 
     def _forward(self, link: Link) -> None:
         try:
@@ -193,6 +195,10 @@ class SupervisedLink:
     def report_motors_turning(self) -> None:
         """Report that the motors turn already, before the first command."""
         self._send(b"T")
+
+    def kill(self) -> None:
+        """Stop the motors until a command to disarm."""
+        self._send(b"K")
 
     def _send(self, packet: bytes) -> None:
         with suppress(OSError):  # it is busy, or it has ended, which `receive` reports

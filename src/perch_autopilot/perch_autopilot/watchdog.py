@@ -98,6 +98,10 @@ class Watchdog:
         self._lifted = armed and (self._lifted or lifts(sticks, self._hover))
         self._locked = self._locked and armed
 
+    def kill(self) -> None:
+        """Stop the motors, also in a descent without commands, until a command to disarm."""
+        self._locked = self.command_received = True
+
     def channels(self, now: float) -> Channels:
         """Return the channels for the autopilot at a time [s], in us, and set `mode`; stale commands are never returned."""
         age = now - self._command_time
