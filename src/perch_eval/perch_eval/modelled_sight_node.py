@@ -93,7 +93,7 @@ def imageless_launches(scenario: Scenario, seed: int, source: str, lockstep: boo
     """
     nodes = ["vio_model" if name == "vio" else name for name in choose_nodes(scenario, extra=extra)]
     own: dict[str, Any] = {"scenario": source, "seed": seed}
-    changed = {"vehicle": lambda p: {**p, "cameras": "none"}, "target_localizer": lambda p: {**p, **own}, "powerline_mapper": lambda p: own}
+    changed = {"vehicle": lambda p: {**p, "cameras": "none"}, "target_localizer": lambda p: {**p, **own}, "powerline_mapper": lambda p: {**p, **own}}
     launches = node_launches(scenario, nodes, seed=seed, scenario_source=source, lockstep=lockstep, **options)
     return tuple(NodeLaunch(one.name, changed.get(one.name, dict)(one.parameters), one.host) for one in launches)
 

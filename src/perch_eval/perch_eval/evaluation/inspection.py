@@ -6,7 +6,6 @@ import numpy as np
 
 from perch_eval.evaluation.kept import cached_figures
 from perch_eval.evaluation.sections import Effort, Section
-from perch_eval.in_process.modelled_sight import MAP_ERROR
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.flight import fly
 from perch_eval.inspection.layout import random_layout
@@ -27,7 +26,7 @@ def _figures(effort: Effort) -> Section:
     flight = fly(load_scenario(SCENARIO), SEED)
     out = Section("p_fig_4_5", "[P] Fig. 4 and 5: inspection with the constraints in the NMPC",
                   f"Scenario `{SCENARIO}`, seed {SEED}, flown in one process without ROS (plant, IMU, UKF, NMPC); VIO and the map of the cables by "
-                  f"their error models (map: {100 * MAP_ERROR:g} cm at each end and axis). Judged by the true lines; "
+                  "their error models. Judged by the true lines; "
                   "a line beyond the image's corners counts as at them. "
                   "The reference is the straight lines between the waypoints.")
     for name, draw, caption in (("p_fig_4.png", paths_figure, "Reference (dashed, collisions red) and flown path with the heading (green)"),

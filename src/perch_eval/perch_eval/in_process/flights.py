@@ -77,7 +77,7 @@ def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, repl
         elif name == "target_localizer" and sensing.target == "model":
             components[name] = modelled_target_localizer(parameters.node_config(name, TargetLocalizerConfig), vehicle, seed)
         elif name == "powerline_mapper" and sensing.target == "model":
-            components[name] = ModelledMap(MapParameters(seed=seed), scenario)
+            components[name] = ModelledMap(replaced(parameters.node_config(name, MapParameters), seed=seed), scenario)
         else:
             components[name] = parameters.component(name)
     planner = PLANNERS.get(scenario.mode)
