@@ -139,6 +139,8 @@ def test_replace_checks_ranges():
 @pytest.mark.parametrize("key, names, words", [
     ("foo", [f"speed_{k}" for k in "abcdefghijklmnopqrst"], "unknown setting; allowed: speed_a, speed_b, speed_c, speed_d,"),
     ("speed_ab", [f"speed_{k}" for k in "abcdefghijklmnopqrst"], "unknown setting; did you mean speed_b"),
+    ("motor_lag", ["motor_time", "lag_max", "rotor_yaw_sign", *[f"x_{k}" for k in "abcdefghijklmnopqrst"]], "did you mean motor_time, "),
+    ("arm", ["name", "cameras", *[f"x_{k}" for k in "abcdefghijklmnopqrst"]], "unknown setting; allowed: name, cameras, x_a"),
     ("foo", [f"{group}.gain_{k}" for group in ("rate", "tilt") for k in range(10)], "unknown setting; the 20 names begin with rate, tilt")])
 def test_an_unknown_name_comes_with_those_allowed_or_near_or_their_groups(key, names, words):
     assert words in str(config.unknown("x.yaml", key, "setting", names))

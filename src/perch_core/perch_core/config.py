@@ -143,9 +143,13 @@ def _convert(kind: Any, value: Any, source: str, key: str) -> Any:
 
 
 def unknown(source: str, key: str, kind: str, names: Iterable[str]) -> ConfigError:
-    """Return the error for an unknown name; it lists the valid names, or where there are many the closest matches or their groups."""
+    """Return the error for an unknown name; it lists the valid names, or where there are many those that are spelled
+    alike or have a word in common, or their groups."""
     names = list(names)
-    close = difflib.get_close_matches(key, names, n=5, cutoff=0.4)
+    words = set(re.findall("[a-z]{3,}", key)) - {"max", "min"}
+    alike = {name: difflib.SequenceMatcher(None, name, key).ratio() for name in names}
+    near = [name for name in names if alike[name] >= 0.6 or words & set(re.findall("[a-z]{3,}", name))]
+    close = sorted(near, key=lambda name: (alike[name], name), reverse=True)[:5]
     groups = list(dict.fromkeys(name.split(".")[0] for name in names))
     if len(names) <= 16 or not close and len(groups) == len(names):
         hint = f"allowed: {', '.join(names)}"
