@@ -57,6 +57,20 @@ def test_a_plan_is_found_where(planner: PowerlinePlanner, why: str, target: int,
     assert plan.recovery is not None and all(bound.holds for bound in plan.bounds), why
 
 
+@pytest.mark.parametrize("why, line_height, pitch_deg, position, perception", [
+    ("the start is nearer to the least height than the margin", 2.0, 134.0, (1.0, 0.5, 0.81), True),
+    ("the perch is nearer to the least height than the margin", 0.68, 24.0, (1.5, 0.3, 1.2), True)])
+def test_a_plan_is_found_near_the_limits(planner: PowerlinePlanner, why: str, line_height: float, pitch_deg: float, position: tuple,
+                                         perception: bool) -> None:
+    line = Segment(np.array([4.0, 0.0, line_height]), np.array([0.0, 1.0, 0.0]), 3.0, 0.03, 0)
+    start = REQUEST.start.copy()
+    start[P] = position
+    perch = PerchPose.on_line(line, line.centre, np.radians(pitch_deg), VEHICLE.wire_offset, start[P])
+    plan = planner.plan(replace(REQUEST, start=start, lines=(line,), target_line=0, perch=perch, perception=perception, with_recovery=False,
+                                deadline=10.0))
+    assert all(bound.holds for bound in plan.bounds), why
+
+
 @pytest.mark.parametrize("what, pitch_deg, along, position, yaw, velocity", [
     ("perch", 154.67, -0.039, (1.97, 1.126, 5.259), -0.143, (0.03, -0.093, -0.124)),
     ("recovery", 120.42, -0.082, (1.279, -1.429, 5.275), 0.624, (0.428, 0.118, -0.305))])

@@ -26,6 +26,7 @@ from perch_planner.powerline.stage_functions import line_parameters
 
 LINES_MAX = 6  # segments in the problem: the target and the nearest others; the check takes all
 ATTEMPTS = 6  # solves of one manoeuvre: with a larger N, or from another guess and with another solver
+REFINEMENTS = 2  # solves with the same N for the end alone: each leaves a hundredth of its error
 MARGIN_DECAY = 0.75  # of `leaving` and `approaching`, after each solve that finds no plan to the end: they may be reduced, unlike the limits
 RADIUS_REDUCTION = 0.02  # the paper's, for a recovery that starts at the wire: part of a wire's radius is safety [m]
 
@@ -114,17 +115,18 @@ class Search:
             return guess.perch_guess(self.solver.model, request.start, pose.p_WB, pose.s3_W, s.height_min + 0.05, intervals,
                                      T0 * (1.0, 1.3, 0.8, 1.6, 1.1, 0.9)[attempt], yaw_turn, b3_turn)
 
-        approaching = min(s.margins.approaching, _clearance_margin(self._clearance(request.start, request.lines)))
+        margins, _ = self._end_margins(request.start, request.lines, pose.p_WB[2])
+        approaching = min(margins.approaching, _clearance_margin(self._clearance(request.start, request.lines)))
         end_clearance_max = _clearance_margin(0.5 * self._clearance(np.concatenate([pose.p_WB, pose.q_WB]), request.lines))
         return Task(
             "perch", request, pose, _select_lines(request.lines, target, request.start[P], pose.p_WB), formulation.perch,
-            "perched" if formulation.hard_end else "", s.duration, s.margins, first_guess, formulation.accuracy, approaching=approaching,
+            "perched" if formulation.hard_end else "", s.duration, margins, first_guess, formulation.accuracy, approaching=approaching,
             end_clearance_max=end_clearance_max)
 
     def recovery(self, request: PowerlineRequest, hover: np.ndarray) -> Task:
         """Return the task of a recovery from the start of a request towards a hover position [m], without perception."""
         s, formulation, start = self.settings, self.formulation, request.start
-        margins, reduction = self._start_margins(start, request.lines)
+        margins, reduction = self._end_margins(start, request.lines)
 
         def first_guess(attempt: int, intervals: int) -> tuple[np.ndarray, np.ndarray]:
             return guess.recovery_guess(self.solver.model, start, hover, s.height_min + 0.1, intervals, (1.2, 0.9, 1.6, 1.9, 0.7, 1.4)[attempt])
@@ -135,14 +137,14 @@ class Search:
             formulation.recovery, "hovering" if formulation.hard_end else "", s.recovery_duration, margins, first_guess,
             (np.inf, *formulation.accuracy[1:]), leaving=margins.leaving, radius_reduction=reduction)
 
-    def _start_margins(self, start: np.ndarray, lines: tuple[Segment, ...]) -> tuple[Margins, float]:
-        """Margins that the start of a recovery permits, and the reduction of the wires' radii [m] that frees it from collision.
+    def _end_margins(self, start: np.ndarray, lines: tuple[Segment, ...], end_height: float = np.inf) -> tuple[Margins, float]:
+        """Margins that a start and the height of an end [m] permit, and the reduction of the wires' radii [m] that frees the start.
 
         Raises:
             PlanningRefusal: the body cuts a wire even with the reduced radius.
         """
         margins, clearance = self.settings.margins, np.inf
-        height = min(margins.height, max(0.0, 0.5 * (start[2] - self.settings.height_min)))
+        height = min(margins.height, max(0.0, 0.5 * (min(start[2], end_height) - self.settings.height_min)))
         for reduction in (0.0, RADIUS_REDUCTION):
             reduced_lines = [line.with_reduced_radius(reduction) for line in lines]
             clearance = self._clearance(start, reduced_lines)
@@ -170,7 +172,7 @@ class Search:
         """
         s, vehicle, thrust_max = self.settings, self.vehicle, self._thrust_max(task)
         margins, margin_scale, intervals, lines, solver_name = task.margins, MARGIN_DECAY**first, s.intervals, task.lines, task.request.solver
-        iterations, time, cpu_time, attempt_time, first_violated, previous, phase = 0, 0.0, 0.0, 0.0, None, None, start_phase
+        iterations, time, cpu_time, attempt_time, first_violated, previous, phase, refined = 0, 0.0, 0.0, 0.0, None, None, start_phase, 0
         for attempt in range(first, ATTEMPTS):
             if attempt > first and time + attempt_time > task.request.deadline:  # a refusal with its cause is worth more than being stopped
                 break
@@ -202,7 +204,8 @@ class Search:
             first_violated = violated[0]
             lines = _with_missing_line(lines, task.request.lines, simulated, max(vehicle.body_radii))
             only_end_missed = all(bound.quantity.startswith("end_") for bound in violated)
-            refine = only_end_missed and phase != "refine"
+            refine = only_end_missed and refined < REFINEMENTS
+            refined = refined + 1 if refine else 0
             if not refine:
                 intervals = int(np.ceil(1.5 * intervals))
                 margin_scale *= MARGIN_DECAY if only_end_missed else 1.0
