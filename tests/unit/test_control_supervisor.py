@@ -13,6 +13,7 @@ from perch_control.guidance import Blend, Hold, Polynomial, blended, brake, quin
 from perch_control.maneuvers import following, recovered
 from perch_control.modes import Command, CommandRefused, State
 from perch_control.odometry_gate import OdometryGate
+from perch_control.sensor_inputs import SensorInputs
 from perch_control.reference import FlatReference, SampledReference
 from perch_core import so3
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory, rest_to_rest
@@ -144,6 +145,7 @@ def test_a_recovery_leaves_a_surface_of_any_inclination(inclination):
     loop.begin_in_hover((0.0, 0.0, 3.0))
     loop.plant.R, begin = so3.exp(np.array([0.0, -turn, 0.0])), loop.plant.p.copy()
     loop.plant.wall = begin, np.array(normal)
+    loop.controller._inputs = SensorInputs()  # odometry begins here: it has not jumped
     loop.run(0.002)
     loop.controller.flight_state = recovered(loop.controller.flight_state._replace(attached_to=normal), "for a test")
     assert loop.run(2.0, until=lambda x: x.controller.state is State.HOVERING), loop.events
@@ -157,6 +159,7 @@ def test_below_an_overhang_a_recovery_does_not_fly_to_the_floor(inclination, hei
     loop, normal = make_loop(floor=-10.0), np.array([-np.sin(turn), 0.0, np.cos(turn)])
     loop.begin_in_hover((0.0, 0.0, 3.0))
     loop.plant.R, contact = so3.exp(np.array([0.0, -turn, 0.0])), loop.plant.p.copy()
+    loop.controller._inputs = SensorInputs()  # odometry begins here: it has not jumped
     loop.run(0.002)
     loop.controller.flight_state = recovered(loop.controller.flight_state._replace(attached_to=tuple(normal)), "for a test")
     lost, edge = [0.0], []

@@ -156,6 +156,29 @@ def test_odometry_that_jumps_and_does_not_know_where_it_is_is_not_followed(varia
     assert (flight.component.flight.flight_state.state_estimate[0] > 0.9) == (state is State.HOVERING)
 
 
+def test_commands_go_on_in_the_order_of_their_stamps_where_those_of_odometry_step_back():
+    """A vehicle ignores a command that is older than the one before."""
+    flight = hovering()
+    for _ in range(100):
+        flight.step(0.002, stamp=flight.stamp - 500_000_000)
+    stamps = [command.stamp for command in flight.motors]
+    assert flight.state is State.LANDING and stamps == sorted(stamps)
+
+
+def test_odometry_that_turns_over_in_flight_is_not_followed_but_a_new_heading_is():
+    for q, state in (((1.0, 0.0, 0.0, 0.0), State.LANDING), ((0.0, 0.0, np.sin(0.3), np.cos(0.3)), State.HOVERING)):
+        flight = hovering()
+        flight.step(0.1, q_WB=q)
+        assert flight.state is state and "attitude jumped" in flight.said
+
+
+def test_odometry_that_turns_over_by_hand_on_the_ground_is_followed():
+    flight = Flight()
+    flight.step(0.1)
+    flight.step(0.1, q_WB=(1.0, 0.0, 0.0, 0.0))
+    assert not flight.component.flight.odometry_refusal
+
+
 def test_a_jump_with_a_covariance_that_is_no_number_is_refused():
     flight = hovering()
     flight.step(0.004, pose_covariance=np.full((6, 6), NAN))

@@ -85,6 +85,7 @@ class Controller(Component[ControllerParameters]):
         self.flight = self._assembly.flight
         self._answered: int | None = None  # newest stamp when odometry was last answered [ns]
         self._first: int | None = None     # stamp of the first answer [ns]
+        self._command_stamp = 0            # of the last command to the vehicle [ns]
         self._statuses = self._references = self._diagnoses = self._steps = 0
         self._due = 0                      # time since then at which the next periodic output is due [ns]
         self._silent = False               # whether IMU or watchdog are answered, as odometry is missing
@@ -250,6 +251,7 @@ class Controller(Component[ControllerParameters]):
     def _answer(self, stamp: int, result: StepResult) -> None:
         """Emit the command to the vehicle first, then the periodic outputs, on one time grid from the first answer on."""
         loop = result.loop
+        self._command_stamp = stamp = max(stamp, self._command_stamp)  # a vehicle ignores a command older than the one before
         if loop is None:
             self.motor_command(MotorCommand(stamp, result.armed, result.rotor_speed))
         elif self._to_vehicle is self.rates_thrust:

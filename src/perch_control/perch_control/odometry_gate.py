@@ -9,6 +9,7 @@ import numpy as np
 
 from perch_core.covariance import largest_sigma
 from perch_core.jit import compiled
+from perch_core.vector3 import axes_of, dot
 
 
 _POSITION_JUMP = 0.25  # largest step between two samples beyond the motion: above a correction of VIO [m]
@@ -35,13 +36,16 @@ class OdometryGate:
         self._covariances: tuple[np.ndarray, np.ndarray] | None = None  # of the last accepted sample
         self._candidate: tuple[float, float, tuple[float, ...]] | None = None  # first stamp, last stamp, state
 
-    def check(self, stamp: float, state: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None = None) -> Verdict:
+    def check(self, stamp: float, state: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None = None,
+              flying: bool = False) -> Verdict:
         """Judge one sample whose values are within their limits.
 
         Args:
             stamp: [s].
             state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
             covariances: of pose and twist as in `OdometryState`, shapes (6, 6); None: unknown, a jump that lasts is accepted.
+            flying: whether the vehicle flies: a jump of b3 is not accepted then, however long it lasts. The attitude before it was
+                flown on, and no correction of VIO changes the direction of gravity.
         """
         if self.stamp is None:
             return self._accept(stamp, state, covariances)
@@ -54,8 +58,8 @@ class OdometryGate:
             self._candidate = (stamp, stamp, state)
         self._candidate = (self._candidate[0], stamp, state)
         if stamp - self._candidate[0] >= _CONFIRM:
-            if uncertain := self._uncertain_part(covariances):
-                return Verdict(False, reason=f"{problem}, {uncertain}")
+            if doubt := self._uncertain_part(covariances) or (self._tilt_change(stamp, state) if flying else ""):
+                return Verdict(False, reason=f"{problem}, {doubt}")
             return self._accept(stamp, state, covariances, problem)
         return Verdict(False, reason=problem)
 
@@ -80,6 +84,13 @@ class OdometryGate:
             if sigma > limit:
                 return f"and its {name} is less certain by {sigma:.2g} {unit}"
         return ""
+
+    def _tilt_change(self, stamp: float, state: tuple[float, ...]) -> str:
+        """Return that b3 has turned since the last accepted sample by more than the body rates explain; empty: it has not."""
+        assert self.stamp is not None
+        *_, spun = _changes(self.state, state, stamp - self.stamp)
+        turn = acos(min(max(dot(axes_of(self.state[6:10])[2], axes_of(state[6:10])[2]), -1.0), 1.0))
+        return f"and its tilt by {degrees(turn):.0f} deg" if degrees(turn - spun) > _ATTITUDE_JUMP else ""
 
     def _jump_reason(self, t0: float, a: tuple[float, ...], t1: float, b: tuple[float, ...]) -> str:
         """Return why the step from one sample to another is a jump; empty: it is none."""

@@ -47,7 +47,7 @@ class SensorInputs:
     def odometry(self, x: FlightState, stamp: float, sample: tuple[float, ...], covariances: tuple[np.ndarray, np.ndarray] | None,
                  problem: str) -> tuple[FlightState, Verdict]:
         """Return the state from a sample, or predicted, and the verdict on it; arguments as in `FlightController.step`."""
-        verdict = Verdict(False, reason=f"odometry: {problem}") if problem else self._gate.check(stamp, sample, covariances)
+        verdict = Verdict(False, reason=f"odometry: {problem}") if problem else self._gate.check(stamp, sample, covariances, x.flying)
         # Odometry that repeats itself does not stop the time.
         x = self._state_at(x, stamp if stamp > x.now else max(x.now, self._imu_stamp), verdict, sample)
         self.age = x.now - self._gate.stamp if self._gate.stamp is not None else inf
