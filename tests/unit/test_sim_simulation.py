@@ -126,6 +126,7 @@ def test_a_process_of_its_own_draws_the_same_images_and_its_end_costs_images_onl
         os.kill(drawing._clients["front"].process.pid, signal.SIGINT)  # Ctrl-C in the terminal is the vehicle's matter
         assert len(images(drawing, 1)) == 1
         os.kill(drawing._clients["front"].process.pid, signal.SIGKILL)
+        drawing._clients["front"].process.wait()
         flight = Simulation(SCENARIO, 3, drawing)
         camera, frames = flight.cameras["front"], 0
         while frames < 2:

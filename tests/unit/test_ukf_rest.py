@@ -152,3 +152,10 @@ def test_a_pose_that_the_imu_history_does_not_reach_is_too_old():
         assert (outcome is VioOutcome.TOO_OLD) or stamp >= estimator._imu.oldest
         outcomes.add(outcome)
     assert VioOutcome.TOO_OLD in outcomes
+
+
+@pytest.mark.parametrize("gap", [0.6, 2.0, 10.0])
+def test_an_imu_that_comes_back_at_rest_after_a_gap_longer_than_its_history_is_no_error(gap):
+    resting = Resting()
+    resting.k += round(gap * RATE)
+    assert resting.run(1.0).estimator.estimate is not None

@@ -218,6 +218,8 @@ class Estimator:
         try:
             if not self._resting:
                 begin = max(belief.stamp, 2 * middle - now)
+                if self._anchors[0].stamp > begin:  # the IMU has just come back after a gap longer than its history
+                    return
                 anchor = self._anchor(begin)
                 stopped = after_stop(self._transform.predict(anchor, self._imu.run(anchor.stamp, begin), begin))
                 if stopped is None:
