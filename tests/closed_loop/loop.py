@@ -17,14 +17,14 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import GeometricController
 from perch_control.guidance import Hold
 from perch_control.maneuvers import entered, following
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_control.nmpc import NmpcController, NmpcSettings
 from perch_control.parameters import ControllerChoice, ControllerParameters
 from perch_control.reference import FlatReference
 from perch_control.rotor_lag import RotorEstimate
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
-from perch_core.values import OdometryState, seconds
+from perch_core.values import Command, OdometryState, seconds
 from perch_core.vehicle import ControlGains, Vehicle, load_vehicle
 from perch_eval.in_process import Loop as FlightLoop
 from perch_planner.planner import plan

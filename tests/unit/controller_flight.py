@@ -9,10 +9,10 @@ import numpy as np
 
 from closed_loop.plant import Disturbances, Plant
 from perch_control.controller import Controller
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_control.parameters import ControllerChoice, ControllerParameters
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
-from perch_core.values import NANOSECONDS, ControllerCommand, ImuSample, OdometryState, TrajectoryOrder, rotated
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, TrajectoryOrder, rotated
 from perch_core.vehicle import load_vehicle
 
 _NONE = np.zeros((6, 6))

@@ -11,7 +11,7 @@ from perch_autopilot.link import Link, LinkError
 from perch_autopilot.mavlink import ClockOffset, Mavlink, MavlinkParameters
 from perch_autopilot.offboard import ARDUPILOT, ARMED, GUIDED_NOGPS, OFFBOARD, PX4, Offboard, Request
 from perch_core.component import Output, ports
-from perch_core.values import NANOSECONDS, OdometryState, RatesThrust
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, OdometryState, RatesThrust
 from perch_core.vehicle import load_vehicle
 
 SECOND = NANOSECONDS
@@ -307,6 +307,22 @@ def test_it_disarms_in_flight_what_it_has_flown(autopilot):
     autopilot.say(m.command_ack_encode(400, 1))
     autopilot.heard()
     assert "refuses disarming: TEMPORARILY_REJECTED" in autopilot.got["log"][-1].text
+
+
+def test_kill_stops_the_motors_also_where_no_controller_commands(autopilot):
+    """In the autopilot's own failsafe, whose mode is not that of set points. The decision of another time or clock does not count."""
+    m = autopilot.mavlink
+    autopilot.say(m.heartbeat_encode(2, PX4, ARMED, 0, 4))
+    autopilot.heard(2.0)
+
+    def sent(command: Command, stamp: int) -> tuple | None:
+        autopilot.node.on_command(ControllerCommand(stamp, command, "a person's decision"))
+        order = autopilot.heard().get("COMMAND_LONG")
+        return order and (order.command, order.param1, order.param2)
+
+    assert sent(Command.LAND, autopilot.now) is None
+    assert sent(Command.KILL, autopilot.now - 2 * SECOND) is None
+    assert sent(Command.KILL, autopilot.now) == sent(Command.KILL, 0) == (400, 0.0, 21196.0)
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------

@@ -11,11 +11,12 @@ from closed_loop.loop import fly_to_contact, make_loop, perch, predictive
 from closed_loop.plant import EstimationError
 from perch_control.admission import AtEnd, TrajectoryRefused
 from perch_control.l1 import L1Augmentation
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_control.parameters import ControllerParameters
 from perch_core.config import from_mapping
 from perch_core.errors import ConfigError
 from perch_core.trajectory import rest_to_rest
+from perch_core.values import Command
 
 PERCHES = ("surface_90_1.7m", "surface_90_3m", "surface_60_1.7m")
 

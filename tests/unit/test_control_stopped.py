@@ -11,11 +11,11 @@ from closed_loop.loop import make_loop, perch
 from closed_loop.plant import Disturbances
 from perch_control.admission import AtEnd, Order, TrajectoryRefused
 from perch_control.flight_settings import FlightSettings
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_control.recovery import Recovery
 from perch_control.reference import SampledReference
 from perch_core.trajectory import rest_to_rest
-from perch_core.values import TriggerRequest
+from perch_core.values import Command, TriggerRequest
 from perch_planner.problem import PerchSettings
 from unit.controller_flight import Flight, hovering, parameters
 from unit.test_control_supervisor import along_x, hovering as hovering_loop, leaving, moved, ready

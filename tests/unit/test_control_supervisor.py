@@ -11,12 +11,13 @@ from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joint
 from perch_control.flight_settings import FlightSettings
 from perch_control.guidance import Blend, Hold, Polynomial, blended, brake, quintic
 from perch_control.maneuvers import following, recovered
-from perch_control.modes import Command, CommandRefused, State
+from perch_control.modes import CommandRefused, State
 from perch_control.odometry_gate import OdometryGate
 from perch_control.sensor_inputs import SensorInputs
 from perch_control.reference import FlatReference, SampledReference
 from perch_core import so3
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory, rest_to_rest
+from perch_core.values import Command
 
 REST = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 

@@ -12,13 +12,13 @@ import pytest
 from closed_loop.plant import Disturbances, Plant
 from perch_control.controller import Controller
 from perch_control.laws import LAWS
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_control.parameters import ControllerChoice
 from perch_core.errors import ConfigError, PerchError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
-    NANOSECONDS, AtEnd, ControllerCommand, EstimatorHealth, MappedPowerline, PowerlineMap, SetControllerRequest, TrajectoryOrder, Transform,
-    TriggerRequest)
+    NANOSECONDS, AtEnd, Command, ControllerCommand, EstimatorHealth, MappedPowerline, PowerlineMap, SetControllerRequest,
+    TrajectoryOrder, Transform, TriggerRequest)
 from perch_core.vehicle import load_vehicle
 from unit.controller_flight import START, Flight, hovering, parameters
 

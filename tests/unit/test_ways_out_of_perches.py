@@ -11,10 +11,10 @@ import pytest
 from closed_loop.loop import make_loop, perch
 from perch_control.admission import AtEnd, Order, check_order
 from perch_control.mission.ways_out import WaysOut
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_control.reference import FlatReference
 from perch_core.surface import PerchSurface
-from perch_core.values import TrajectoryOrder
+from perch_core.values import Command, TrajectoryOrder
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.control_flights.aborted import fly_cancelled
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState

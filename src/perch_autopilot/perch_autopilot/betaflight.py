@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
-from perch_core.values import NANOSECONDS, ControllerCommand, ImuSample, RatesThrust
+from perch_core.values import NANOSECONDS, STALE, Command, ControllerCommand, ImuSample, RatesThrust
 from perch_core.vehicle import GRAVITY
 from perch_autopilot import msp
 from perch_autopilot.clock import clock_jump
@@ -19,8 +19,6 @@ from perch_autopilot.link import REOPEN, LinkError
 
 _HANDSHAKE = 2.0                     # for the autopilot's version [s]
 _REFUSED = NANOSECONDS               # a command to arm without effect for so long is refused [ns]
-_KILL = 5                            # perch_msgs/ControllerCommand
-_STALE = NANOSECONDS                 # age at which a command is no longer current, as for the controller [ns]
 _SLOW_REQUESTS = (msp.STATUS, msp.ATTITUDE, msp.ANALOG)
 
 
@@ -123,7 +121,7 @@ class Betaflight(Component[BetaflightParameters]):
 
     def on_command(self, command: ControllerCommand) -> None:
         """Stop the motors on KILL, also where no controller is there to obey it."""
-        if command.command == _KILL and not 0 < command.stamp < (self._now or 0) - _STALE:
+        if command.command == Command.KILL and not 0 < command.stamp < (self._now or 0) - STALE:
             self._link.kill()
 
     # -- from it -----------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ import numpy as np
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
-from perch_core.values import NANOSECONDS, ImuSample, OdometryState, RatesThrust
+from perch_core.values import NANOSECONDS, STALE, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust
 from perch_autopilot import frames
 from perch_autopilot.clock import MAX_STEP, clock_jump
 from perch_autopilot.offboard import ANGLE_BOOST, ARDUPILOT, GUID_OPTIONS, HEARTBEAT_TIMEOUT, PX4, THRUST_AS_THRUST, Offboard, Request
@@ -29,7 +29,7 @@ from perch_autopilot.rates import commanded_vehicle
 
 _HANDSHAKE = 3.0                     # for the autopilot's first heartbeat, which come once a second [s]
 _JUMP_SAMPLES = 3                    # samples in a row that do not follow the last one: its clock has jumped
-_STALE = 100_000_000                 # a command that is older is not sent any more [ns]
+_HELD = 100_000_000                  # rates and thrust that are older are not sent any more [ns]
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
 _SET_MODE, _ARM_DISARM = 176, 400     # MAV_CMD_DO_SET_MODE, MAV_CMD_COMPONENT_ARM_DISARM
 _FORCED = 21196.0                    # of MAV_CMD_COMPONENT_ARM_DISARM: disarm also in flight
@@ -78,6 +78,7 @@ class Mavlink(Component[MavlinkParameters]):
     config_type = MavlinkParameters
 
     rates_thrust = Input(RatesThrust, "rates_thrust_command")
+    command = Input(ControllerCommand, "controller/command")
     odometry = Input(OdometryState, "odometry")
     poll = Timer(0.005)
     imu = Output(ImuSample, "imu/data_raw")
@@ -132,6 +133,12 @@ class Mavlink(Component[MavlinkParameters]):
             return
         self._command, self._command_time = command, self._now or 0
 
+    def on_command(self, command: ControllerCommand) -> None:
+        """Stop the motors on KILL in any mode and at any height, also where no controller is there to obey it."""
+        if command.command == Command.KILL and not 0 < command.stamp < (self._now or 0) - STALE:
+            self._command = None
+            self._send_command(_ARM_DISARM, 0.0, _FORCED)
+
     def on_odometry(self, state: OdometryState) -> None:
         """Send odometry to the autopilot's own estimator, in its axes, stamped by the host's clock (TIMESYNC); 50 Hz at most."""
         if self._last_odometry is not None and 0 <= state.stamp - self._last_odometry < _ODOMETRY_PERIOD:
@@ -174,7 +181,7 @@ class Mavlink(Component[MavlinkParameters]):
         for message in self._mavlink.parse_buffer(self._received(now)) or ():
             self._handle_message(message, now)
         command = self._command if self.offboard.takes_thrust else None
-        if command is not None and not 0 <= now - self._command_time <= _STALE:
+        if command is not None and not 0 <= now - self._command_time <= _HELD:
             command = None
         if command is not None and not command.armed and self.offboard.armed and not self.offboard.commanding:
             self.log(LogLine("error", "commands have the motors off, but a flight may have begun before them (was the controller started "

@@ -10,14 +10,14 @@ from perch_core.component import Component, Diagnostics, Emitter, Input, Output,
 from perch_core.errors import ConfigError, PerchError
 from perch_core.imu_axes import ImuAxes
 from perch_core.values import (
-    NANOSECONDS, AtEnd, AttitudeThrust, ControllerCommand, ControllerStatus, ControlReference, EstimatorHealth, ImuSample, MotorCommand,
-    OdometryState, PowerlineMap, RatesThrust, SetControllerRequest, SetControllerResponse, TrajectoryOrder, Transform, TriggerRequest,
-    TriggerResponse, nanoseconds, seconds)
+    NANOSECONDS, STALE, AtEnd, AttitudeThrust, Command, ControlReference, ControllerCommand, ControllerStatus, EstimatorHealth,
+    ImuSample, MotorCommand, OdometryState, PowerlineMap, RatesThrust, SetControllerRequest, SetControllerResponse,
+    TrajectoryOrder, Transform, TriggerRequest, TriggerResponse, nanoseconds, seconds)
 from perch_core.values.limits import problem
 from perch_core.vehicle import load_vehicle
 from perch_control.assembly import Assembly, LawNotReady
 from perch_control.dry_run import dry_run
-from perch_control.modes import Command, CommandRefused, State, StepResult
+from perch_control.modes import CommandRefused, State, StepResult
 from perch_control.parameters import ControllerParameters
 from perch_control.reference import Setpoint
 from perch_control.stamp_guard import Stamp, StampGuard
@@ -27,7 +27,6 @@ DIAGNOSTICS_PERIOD = NANOSECONDS
 DIAGNOSTICS_PHASE = 666_000_000   # not with the status [ns]
 BLIND_AFTER = 0.08                # without odometry for so long, IMU samples are answered; motors stop 0.1 s after the last command [s]
 LONGEST_PLAN = 60.0               # a way out that starts later does not belong to the running trajectory [s]
-STALE = NANOSECONDS               # age at which a command or an estimator's status is no longer current [ns]
 INPUTS_LOST_AFTER = NANOSECONDS   # without any input for so long, a restart of time is accepted in flight, too [ns]
 _FIXED = ("vehicle", "sensors")   # parameters that do not change after the start
 _REASON_LENGTH = 200              # characters of a reason that are passed on

@@ -14,10 +14,11 @@ from perch_control.flight_settings import FlightSettings
 from perch_control.geometric import GeometricController
 from perch_control.l1 import L1Augmentation
 from perch_control.maneuvers import recovered
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_control.period import NOMINAL_PERIOD
 from perch_control.reference import FlatReference, SampledReference, Vector
 from perch_core.trajectory import SampledTrajectory, rest_to_rest
+from perch_core.values import Command
 from perch_core.vehicle import GRAVITY, ControlGains, Vehicle
 
 _RISE = 1.0  # [s]

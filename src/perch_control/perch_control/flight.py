@@ -7,6 +7,7 @@ from math import dist
 
 import numpy as np
 
+from perch_core.values import Command
 from perch_core.vector3 import axes_of
 from perch_core.vehicle import GRAVITY, ControlGains, Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
@@ -18,7 +19,7 @@ from perch_control.l1 import L1Augmentation
 from perch_control.law import NO_COMPENSATION, Law
 from perch_control.maneuvers import (
     attached, descending, entered, hover_after_jump, land_on_command, landing, motors_off, recovered, stopped)
-from perch_control.modes import Command, CommandRefused, State, StepResult
+from perch_control.modes import CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
 from perch_control.recovery import Recovery

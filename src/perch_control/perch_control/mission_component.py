@@ -12,8 +12,8 @@ import numpy as np
 from perch_core.component import Action, Client, Component, Diagnostics, Goal, Input, Output, Service, Unavailable, Timer
 from perch_core.imu_axes import ImuAxes
 from perch_core.values import (
-    NANOSECONDS, AtEnd, ControllerCommand, ControllerStatus, EstimatorHealth, ImuSample, OdometryState, PerchFeedback, PerchGoal, PerchPlan,
-    PerchPlanRequest, PerchResult, PowerlineMap, PowerlinePlan, PowerlinePlanRequest, TargetPose, TrajectoryOrder, Transform,
+    NANOSECONDS, STALE, AtEnd, ControllerCommand, ControllerStatus, EstimatorHealth, ImuSample, OdometryState, PerchFeedback, PerchGoal,
+    PerchPlan, PerchPlanRequest, PerchResult, PowerlineMap, PowerlinePlan, PowerlinePlanRequest, TargetPose, TrajectoryOrder, Transform,
     TriggerRequest, TriggerResponse, nanoseconds, seconds)
 from perch_control.mission.awaited import awaited, overdue, overdue_at_start
 from perch_control.mission.departure import Departure
@@ -33,7 +33,6 @@ from perch_control.stamp_guard import Stamp, StampGuard
 FEEDBACK_PERIOD = NANOSECONDS // 10  # where nothing changes [ns]
 ODOMETRY_TIMEOUT = NANOSECONDS // 2  # without odometry for so long, the host's time is used instead [ns]
 TICK_NS = nanoseconds(TICK)          # [ns]
-STALE = NANOSECONDS                  # age at which a message is no longer current [ns]
 RUNNING = 1                          # perch_msgs/EstimatorStatus
 IMU_SAMPLES_MAX = 4000               # samples between two ticks that are kept
 _ENDINGS = {Result.PERCHED: "succeeded", Result.CANCELLED: "cancelled"}

@@ -1,4 +1,4 @@
-"""States and commands of the controller, with the values of the messages, and the result of a control step."""
+"""States of the controller, with the values of the messages, and the result of a control step."""
 
 from __future__ import annotations
 
@@ -21,17 +21,6 @@ class State(IntEnum):
     LANDING = 5
     FAILED = 6
     ATTACHED = 7
-
-
-class Command(IntEnum):
-    """Command to the controller, as in `perch_msgs/ControllerCommand`."""
-
-    DISARM = 0
-    ARM = 1
-    HOVER = 2
-    LAND = 3
-    ATTACHED = 4
-    KILL = 5
 
 
 FLYING = (State.TRACKING, State.HOVERING, State.RECOVERING, State.LANDING)

@@ -147,9 +147,8 @@ def unknown(source: str, key: str, kind: str, names: Iterable[str]) -> ConfigErr
     alike or have a word in common, or their groups."""
     names = list(names)
     words = set(re.findall("[a-z]{3,}", key)) - {"max", "min"}
-    alike = {name: difflib.SequenceMatcher(None, name, key).ratio() for name in names}
-    near = [name for name in names if alike[name] >= 0.6 or words & set(re.findall("[a-z]{3,}", name))]
-    close = sorted(near, key=lambda name: (alike[name], name), reverse=True)[:5]
+    related = [name for name in names if words & set(re.findall("[a-z]{3,}", name))]
+    close = list(dict.fromkeys(difflib.get_close_matches(key, names, 5) + difflib.get_close_matches(key, related, 5, cutoff=0.0)))[:5]
     groups = list(dict.fromkeys(name.split(".")[0] for name in names))
     if len(names) <= 16 or not close and len(groups) == len(names):
         hint = f"allowed: {', '.join(names)}"

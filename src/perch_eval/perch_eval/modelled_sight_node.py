@@ -11,22 +11,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from perch_core.component import Input
 from perch_core.config import quantity, text
 from perch_core.ros.node import node
-from perch_core.values import CameraImage, CameraModel, OdometryState
-from perch_eval.in_process.modelled_sight import ModelledMap, ModelledLocalizer
+from perch_eval.in_process.modelled_sight import LONG_TRUTH_BUFFER, ModelledLocalizer, ModelledMap, ModelledSight
 from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
 from perch_perception.target_localizer import TargetLocalizer, TargetLocalizerConfig
 from perch_sim.lockstep import START
 from perch_sim.obstacles import pad_surface
 from perch_sim.scenario import Scenario, load_scenario
-from perch_sim.state_history import StateHistory, TrueState
-
-TRUTH_BUFFER = 1000  # true states kept: 2 s, as images wait for the odometry
+from perch_sim.state_history import StateHistory
 
 
 @dataclass(frozen=True)
@@ -37,13 +31,10 @@ class SightParameters(TargetLocalizerConfig):
     seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
 
 
-class TruthLocalizer(TargetLocalizer):
-    """Target localiser whose sightings are generated from the truth; a frame's `camera_info` replaces its image."""
+class TruthLocalizer(ModelledSight[SightParameters], TargetLocalizer):
+    """Target localiser whose sightings are generated from the truth."""
 
     config_type = SightParameters
-
-    image = None  # type: ignore[assignment]
-    truth = Input(OdometryState, "ground_truth/odometry")
 
     def __init__(self, config: SightParameters) -> None:
         """
@@ -51,28 +42,14 @@ class TruthLocalizer(TargetLocalizer):
             ConfigError: no such scenario, vehicle, camera or board.
         """
         scenario = load_scenario(config.scenario)
-        self._truth, self._newest = StateHistory(TRUTH_BUFFER), 0
-        self._sight = ModelledLocalizer(config, scenario, config.seed, self._truth, lambda: pad_surface(scenario, (self._newest - START) * 1e-9))
+        self.true_states = StateHistory(LONG_TRUTH_BUFFER)
+        self._sight = ModelledLocalizer(config, scenario, config.seed, self.true_states,
+                                        lambda: pad_surface(scenario, (self.true_states.newest - START) * 1e-9))
         super().__init__(config, self._sight)
 
-    def _channel(self, port: str) -> str:
-        return f"camera_{self.config.camera}/camera_info"
-
-    def on_truth(self, state: OdometryState) -> None:
-        """Add a true state, and process frames that waited for it."""
-        if state.stamp > self._newest:
-            self._newest = state.stamp
-            self._truth.append(TrueState(state.stamp, np.array((*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B))))
-        self.advance()
-
-    def on_camera_info(self, model: CameraModel) -> None:
-        """Process a frame as an image without pixels."""
-        super().on_camera_info(model)
-        self.on_image(CameraImage(model.stamp, model.frame, model.camera.width, model.camera.height, "mono8", lambda *_: None))
-
-    def is_ready(self, image: CameraImage) -> bool:
-        """As in the base class, and additionally whether the truth has passed the exposure."""
-        return super().is_ready(image) and self._sight.middle(self._exposure_time(image)) <= self._newest
+    def middle(self, exposure_time: float) -> int:
+        """As `ModelledLocalizer.middle`."""
+        return self._sight.middle(exposure_time)
 
 
 TARGET_LOCALIZER = node("target_localizer", TruthLocalizer)

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from perch_control.modes import Command
 from perch_core.errors import PerchError
 from perch_core.json_values import to_text
+from perch_core.values import Command
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
 from perch_eval.camera_clip import clip

@@ -17,15 +17,15 @@ from perch_control.mission import Target
 from perch_control.mission.adhesion import AdhesionMonitor
 from perch_control.mission.parameters import MissionParameters
 from perch_control.mission_component import RUNNING
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_core import config, so3
 from perch_core.component import Component, Input, Output, Timer
 from perch_core.errors import PerchError
 from perch_core.extends import extended_mapping
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.values import (
-    AtEnd, ControllerCommand, ControllerStatus, ControlReference, EstimatorHealth, ImuSample, OdometryState, PerchPlanRequest, TrajectoryOrder,
-    nanoseconds, seconds)
+    AtEnd, Command, ControlReference, ControllerCommand, ControllerStatus, EstimatorHealth, ImuSample, OdometryState,
+    PerchPlanRequest, TrajectoryOrder, nanoseconds, seconds)
 from perch_eval.in_process import arrange
 from perch_eval.in_process.parameters import NodeParameters
 from perch_sim.scenario import Scenario

@@ -48,6 +48,11 @@ class StateHistory:
     def __init__(self, length: int) -> None:
         self._states: deque[TrueState] = deque(maxlen=length)
 
+    @property
+    def newest(self) -> int:
+        """Time of the newest state [ns]; 0: no states."""
+        return self._states[-1].time if self._states else 0
+
     def append(self, state: TrueState) -> None:
         """Add the newest state."""
         self._states.append(state)

@@ -118,7 +118,7 @@ class MissionMachine(ABC):
         self._moves.settings = self.settings
         self._flown_id = 0
         self._contact_time = float("nan")
-        self._cancelled: str | None = None  # why it was too late, or an empty string; None: not cancelled
+        self._cancelled, self._too_late = False, ""  # and why it was too late, where the perch was not yet complete
         self._enter(Phase.ARMING, time, "waiting for the estimator")
 
     def tick(self, inputs: Inputs) -> Outputs:
@@ -128,7 +128,7 @@ class MissionMachine(ABC):
         self.time_to_contact = float("nan")
         if self.phase is Phase.IDLE:
             return outputs
-        if inputs.cancel and self._cancelled is None:
+        if inputs.cancel and not self._cancelled:
             self._cancel(inputs, outputs)
         elif inputs.controller is ControllerState.FAILED and self.phase is not Phase.PERCHED:
             self._end(outputs, Result.TRACKING_LOST, f"controller failed: {inputs.controller_message}")
@@ -203,7 +203,7 @@ class MissionMachine(ABC):
             return
         if inputs.controller in (ControllerState.DISARMED, ControllerState.LANDING):
             landing = inputs.controller is ControllerState.LANDING
-            result = Result.CANCELLED if self._cancelled is not None else Result.TRACKING_LOST if landing else Result.CRASHED
+            result = Result.CANCELLED if self._cancelled else Result.TRACKING_LOST if landing else Result.CRASHED
             self._end(outputs, result, f"{self._failure}; {inputs.controller_message if landing else 'on the ground'}")
         elif self._elapsed(inputs) > self.settings.phase_timeout:
             outputs.commands.append((Command.LAND, "recovery took too long"))
@@ -214,7 +214,7 @@ class MissionMachine(ABC):
     def _recovered(self, inputs: Inputs, outputs: Outputs) -> None:
         """End the goal or start another attempt, after a recovery has ended in a hover."""
         self._attempts_left -= 1
-        if self._cancelled is not None:
+        if self._cancelled:
             self._end(outputs, Result.CANCELLED, "cancelled; hovering")
         elif self._attempts_left > 0:
             self._go_to_search(inputs, outputs, f"{self._failure}; {self._attempts_left} attempts left")
@@ -277,7 +277,7 @@ class MissionMachine(ABC):
         self._enter(Phase.RECOVERING, inputs.time, why)
 
     def _cancel(self, inputs: Inputs, outputs: Outputs) -> None:
-        self._cancelled = ""
+        self._cancelled = True
         if self.phase is Phase.PERCHED:
             self.message = "cancelled too late: perched"  # the goal ends when the surface is known to hold the vehicle
         elif inputs.controller in (ControllerState.DISARMED, ControllerState.ARMED):
@@ -285,7 +285,7 @@ class MissionMachine(ABC):
             outputs.commands += [(Command.LAND, "cancelled"), (Command.DISARM, "cancelled")]
             self._end(outputs, Result.CANCELLED, "cancelled on the ground")
         elif why := self.committed(inputs.time):
-            self._cancelled = why
+            self._too_late = why
             self.message = f"cancelled too late: {why}"
         else:
             if inputs.controller is not ControllerState.LANDING:

@@ -144,8 +144,8 @@ class PerchingMission(MissionMachine, Generic[R]):
             self._end(outputs, Result.TRACKING_LOST, f"the controller is not attached: {inputs.controller_message}")
         elif self._elapsed(inputs) > self.settings.rest_time:
             result, message = Result.PERCHED, "perched"
-            if self._cancelled is not None:
-                result, message = Result.CANCELLED, f"cancelled too late: perched{self._cancelled and f' ({self._cancelled})'}"
+            if self._cancelled:
+                result, message = Result.CANCELLED, f"cancelled too late: perched{self._too_late and f' ({self._too_late})'}"
             self._end(outputs, result, message, contact_time=self._contact_time)
         elif inputs.controller in _IN_FLIGHT and inputs.time - self._attached_sent_at > ATTACHED_RETRY:
             self._attached_sent_at = inputs.time

@@ -7,10 +7,10 @@ from enum import Enum, IntEnum
 
 import numpy as np
 
-from perch_control.modes import Command, State as ControllerState
+from perch_control.modes import State as ControllerState
 from perch_control.period import NOMINAL_PERIOD
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory, StateSample
-from perch_core.values import AtEnd, MappedPowerline
+from perch_core.values import AtEnd, Command, MappedPowerline
 
 TICK = 0.02  # the mission decides so often [s]
 

@@ -55,8 +55,23 @@ class TrajectoryOrder(NamedTuple):
         return self.recovery_start if self.recovery_start > 0.0 else self.trajectory.duration
 
 
+class Command(IntEnum):
+    """Command to the controller; the values of perch_msgs/ControllerCommand."""
+
+    DISARM = 0
+    ARM = 1
+    HOVER = 2
+    LAND = 3
+    ATTACHED = 4
+    KILL = 5
+
+
 class ControllerCommand(NamedTuple):
-    """A command to the controller other than a trajectory; `command` and fields as in perch_msgs/ControllerCommand."""
+    """A command to the controller other than a trajectory; fields as in perch_msgs/ControllerCommand.
+
+    Attributes:
+        command: a number of `Command`; a sender may have sent another, which the receiver refuses.
+    """
 
     stamp: int
     command: int

@@ -7,6 +7,7 @@ from typing import overload
 import numpy as np
 
 NANOSECONDS = 1_000_000_000
+STALE = NANOSECONDS  # age at which a command or a status is no longer current [ns]
 
 
 @overload

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_core.errors import PerchError
-from perch_core.values import OdometryState, TriggerRequest, seconds
+from perch_core.values import Command, OdometryState, TriggerRequest, seconds
 from perch_eval.control_flights.way_out import Search, search
 from perch_eval.metrics import tilt_degrees
 from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight, scenario_of

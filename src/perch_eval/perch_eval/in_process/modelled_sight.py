@@ -8,9 +8,10 @@ are not modelled.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from perch_core.surface import PerchSurface
 from perch_core.tag_board import load_board
 from perch_core.values import NANOSECONDS, CameraImage, CameraModel, MappedPowerline, OdometryState, PowerlineMap, nanoseconds
 from perch_core.vehicle import load_vehicle
-from perch_perception.camera_component import PosedCameraComponent
+from perch_perception.camera_component import CameraConfig, PosedCameraComponent
 from perch_perception.pose_buffer import BodyState, StampError
 from perch_perception.powerline_mapper import PowerlineMapperConfig
 from perch_perception.tags import Localization, LocalizationRefusal, average_board, solve_board
@@ -147,8 +148,46 @@ class MapParameters(PowerlineMapperConfig):
     seed: int = quantity(1, low=0, high=2**31 - 1, doc="of everything that is random")
 
 
-class ModelledMap(PosedCameraComponent[MapParameters]):
-    """Map with the errors of the mapper, in place of `powerline_mapper`; a frame's `camera_info` replaces its image.
+C = TypeVar("C", bound=CameraConfig)
+
+
+class ModelledSight(PosedCameraComponent[C]):
+    """Camera component that sees by the true states of the vehicle; a frame's `camera_info` replaces its image.
+
+    Attributes:
+        true_states: the recent ones, made by the subclass.
+    """
+
+    image = None  # type: ignore[assignment]
+    truth = Input(OdometryState, "ground_truth/odometry")
+
+    true_states: StateHistory
+
+    @abstractmethod
+    def middle(self, exposure_time: float) -> int:
+        """Return the true middle of an exposure [ns], which by the calibrated stamp offset is at `exposure_time` [s]."""
+
+    def on_truth(self, state: OdometryState) -> None:
+        """Add a true state, and process frames that waited for it."""
+        if state.stamp > self.true_states.newest:
+            self.true_states.append(TrueState(state.stamp, np.array((*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B))))
+        self.advance()
+
+    def on_camera_info(self, model: CameraModel) -> None:
+        """Process a frame as an image without pixels."""
+        super().on_camera_info(model)
+        self.on_image(CameraImage(model.stamp, model.frame, model.camera.width, model.camera.height, "mono8", lambda *_: None))
+
+    def is_ready(self, image: CameraImage) -> bool:
+        """As in the base class, and additionally whether the truth has passed the exposure."""
+        return super().is_ready(image) and self.middle(self._exposure_time(image)) <= self.true_states.newest
+
+    def _channel(self, port: str) -> str:
+        return f"camera_{self.config.camera}/camera_info"
+
+
+class ModelledMap(ModelledSight[MapParameters]):
+    """Map with the errors of the mapper, in place of `powerline_mapper`.
 
     As the mapper's, the place of a cable is that relative to the vehicle when it was last in view, in the frame of the odometry
     without its corrections: drift moves it only while it is out of view. Its error is a share of the distance, the same share
@@ -157,8 +196,6 @@ class ModelledMap(PosedCameraComponent[MapParameters]):
 
     config_type = MapParameters
 
-    image = None  # type: ignore[assignment]
-    truth = Input(OdometryState, "ground_truth/odometry")
     powerlines = Output(PowerlineMap, "powerlines")
 
     def __init__(self, config: MapParameters, scenario: Scenario | None = None) -> None:
@@ -177,29 +214,14 @@ class ModelledMap(PosedCameraComponent[MapParameters]):
             raise PerchError(f"scenario {scenario.name}: cables that sag have no error model; sensing.target must be rendered")
         self._cables = [ModelledCable(Segment.between(np.array(cable.start), np.array(cable.end), cable.radius, k), *rng.normal(size=(2, 2)))
                         for k, cable in enumerate(scenario.world.cables)]
-        self._truth, self._newest, self._last_used = StateHistory(LONG_TRUTH_BUFFER), 0, -np.inf
-
-    def _channel(self, port: str) -> str:
-        return f"camera_{self.config.camera}/camera_info"
+        self.true_states, self._last_used = StateHistory(LONG_TRUTH_BUFFER), -np.inf
 
     def use_camera(self, mount: CameraMount) -> None:
         """Nothing depends on the camera before its frames."""
 
-    def on_truth(self, state: OdometryState) -> None:
-        """Add a true state, and process frames that waited for it."""
-        if state.stamp > self._newest:
-            self._newest = state.stamp
-            self._truth.append(TrueState(state.stamp, np.array((*state.p_WB, *state.q_WB, *state.v_WB, *state.w_B))))
-        self.advance()
-
-    def on_camera_info(self, model: CameraModel) -> None:
-        """Process a frame as an image without pixels."""
-        super().on_camera_info(model)
-        self.on_image(CameraImage(model.stamp, model.frame, model.camera.width, model.camera.height, "mono8", lambda *_: None))
-
-    def is_ready(self, image: CameraImage) -> bool:
-        """As in the base class, and additionally whether the truth has passed the exposure."""
-        return super().is_ready(image) and nanoseconds(self._exposure_time(image)) <= self._newest
+    def middle(self, exposure_time: float) -> int:
+        """Return the exposure's middle as calibrated: the stamp offset has no error in this model."""
+        return nanoseconds(exposure_time)
 
     def process_image(self, image: CameraImage, exposure_time: float) -> None:
         """Place the cables in view, unless the frame exceeds `rate`, and publish the map."""
@@ -207,7 +229,7 @@ class ModelledMap(PosedCameraComponent[MapParameters]):
             return
         self._last_used = exposure_time
         try:
-            body, true = self.bodies.at(exposure_time), self._truth.at(nanoseconds(exposure_time))
+            body, true = self.bodies.at(exposure_time), self.true_states.at(self.middle(exposure_time))
         except (StampError, LookupError) as error:
             self.warn(f"frame not used: {error}", 1.0)
             return

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from perch_control.modes import Command, State
+from perch_control.modes import State
 from perch_core.errors import PerchError
 from perch_core.imu_axes import ImuAxes
-from perch_core.values import ImuSample
+from perch_core.values import Command, ImuSample
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.arguments import command, command_parser
 from perch_eval.preflight import checks
