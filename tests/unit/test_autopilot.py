@@ -147,6 +147,8 @@ def test_the_throttle_follows_the_battery(thrust, voltage, exponent):
     throttle = sticks.throttle(thrust * share)
     assert 0.0 < throttle < 1.0 and throttle == pytest.approx(full)
     assert sticks.covers_voltage(voltage) == (13.6 <= voltage <= 16.8)
+    sticks.set_voltage(0.0)
+    assert sticks.throttle(thrust * share) == throttle
 
 
 class StubAutopilot:

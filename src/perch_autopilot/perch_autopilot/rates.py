@@ -78,8 +78,8 @@ class Sticks:
         return not self.battery.reference or low <= voltage <= high
 
     def set_voltage(self, voltage: float) -> None:
-        """Set the battery's voltage [V], clamped to the range of the thrust curve."""
-        if self.battery.reference:
+        """Set the battery's voltage [V], clamped to the range of the thrust curve. 0 is no measurement: the last voltage stays."""
+        if self.battery.reference and voltage > 0.0:
             low, high = self.battery.range
             self._voltage_factor = (min(max(voltage, low), high) / self.battery.reference) ** self.battery.exponent
 
