@@ -17,12 +17,13 @@ import operator
 import os
 import platform
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from perch_core.processes import without_collector
+from perch_eval.revision import code_version, command_line
 
 _STATISTICS = {"median": lambda x: float(np.median(x)),
                "p99": lambda x: float(np.percentile(x, 99, method="linear" if np.isfinite(x).all() else "higher")),
@@ -90,28 +91,21 @@ def measure(call: Callable[[], object], repetitions: int = 200, warm_up: int = 3
     return times
 
 
-def machine() -> dict[str, object]:
-    """Return a description of this machine."""
+def provenance() -> dict[str, object]:
+    """Return the first entries of a results file: code, command and machine; called before measuring, the load is that of other programs."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
         names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
         model = names[0] if names else model
-    return {"cpu": model, "cores": os.cpu_count(), "load_1min": round(os.getloadavg()[0], 2),
-            "python": platform.python_version(), "numpy": np.__version__, "system": platform.platform()}
+    machine = {"cpu": model, "cores": os.cpu_count(), "load_1min": round(os.getloadavg()[0], 2),
+               "python": platform.python_version(), "numpy": np.__version__, "system": platform.platform()}
+    return {**code_version(), "command": command_line(), "machine": machine}
 
 
-def as_json(group_figures: dict[str, list[Figure]], code: Mapping[str, str], command: str, seeds: Mapping[str, str]) -> dict[str, object]:
-    """Return the figures in their common JSON form.
-
-    Args:
-        group_figures: figures of each group.
-        code: from `code_version()` before they were measured.
-        command: that measured them.
-        seeds: of each group's random problems, in words.
-    """
-    return {**code, "command": command, "machine": machine(), "seeds": seeds,
-            "figures": [{"group": group, **asdict(item)} for group, items in group_figures.items() for item in items]}
+def as_json(group_figures: dict[str, list[Figure]]) -> list[dict[str, object]]:
+    """Return the figures of all groups in their common JSON form."""
+    return [{"group": group, **asdict(item)} for group, items in group_figures.items() for item in items]
 
 
 def table(items: list[Figure]) -> str:

@@ -1,9 +1,6 @@
 #!/usr/bin/env python3
 """Score perception on public recordings and photographs, and write docs/results/recordings.
 
-    git clone https://github.com/OWNER/NAME FOLDER/OWNER/NAME      each repository that is named where one is missing
-    nice -n 15 python3 bench/recordings.py FOLDER
-
 Takes ten minutes on two cores. What is missing is marked "not available".
 """
 
@@ -17,14 +14,28 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
+    from perch_setup import enter
+
+    enter("recordings")
+
 import real_motion
 import recordings_scores as scores
+from perch_core.errors import ConfigError
 from perch_core.json_values import finite, write_json
 from perch_core.processes import single_threaded_blas
+from perch_eval.arguments import command, command_parser, output_folder
 from perch_eval.evaluation.document import machine, table
 from perch_eval.revision import banner, code_version, root
 from recordings_scores import Figures
+
+EXAMPLES = """examples:
+  git clone https://github.com/OWNER/NAME FOLDER/OWNER/NAME        each repository that is named where one is missing
+  nice -n 15 python3 bench/recordings.py FOLDER
+  nice -n 15 python3 bench/recordings.py FOLDER --only floor
+
+exit code: 0 written, 2 wrong arguments or a recording that cannot be scored"""
 
 
 @dataclass(frozen=True)
@@ -262,19 +273,22 @@ def page(results: Mapping[str, Figures], command: str, code: Mapping[str, str]) 
 # -- the command -----------------------------------------------------------------------------------------------------
 
 
-def main() -> int:
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    out = command_parser("recordings.py", __doc__, EXAMPLES)
+    out.add_argument("folder", type=Path, metavar="FOLDER", help="with the repositories in FOLDER/owner/name")
+    out.add_argument("--only", choices=RECORDINGS, metavar="NAME",
+                     help=f"score one of {', '.join(RECORDINGS)}; the others keep their figures of the same code")
+    out.add_argument("--out", type=Path, default=root() / "docs/results/recordings", metavar="DIR", help="of the page")
+    return out
+
+
+def score(arguments: argparse.Namespace) -> int:
     """Score the available recordings and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="with the repositories in FOLDER/owner/name")
-    parser.add_argument("--only", choices=RECORDINGS, metavar="NAME",
-                        help=f"score one of {', '.join(RECORDINGS)}; the others keep their figures of the same code")
-    parser.add_argument("--out", type=Path, default=root() / "docs/results/recordings", metavar="DIR", help="of the page")
-    arguments = parser.parse_args()
     if not arguments.folder.is_dir():
-        parser.error(f"{arguments.folder} is no folder")  # the page would lose every recording
-    arguments.out.mkdir(parents=True, exist_ok=True)
+        raise ConfigError("FOLDER", str(arguments.folder), "is no folder")  # the page would lose every recording
+    data = output_folder(arguments.out) / "results.json"
     single_threaded_blas()
-    data = arguments.out / "results.json"
     before = json.loads(data.read_text()) if arguments.only and data.is_file() else {}
     made_by = "python3 bench/recordings.py FOLDER"
     code = code_version()
@@ -296,6 +310,8 @@ def main() -> int:
     (arguments.out / "README.md").write_text("\n".join(page(results, made_by, code)) + "\n")
     return 0
 
+
+main = command(parser, score)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 from perch_setup import ROOT, command_parser, enter, leave_quietly_on_interrupt
-from perch_setup.enter import INTERRUPTED
 
 GROUPS = ("planner", "perception", "control", "powerline", "sim", "autopilot", "ros")
 EXAMPLES = """examples:
@@ -21,46 +22,43 @@ exit code: 0 every required value is met, 1 one is not or a group could not be m
 
 
 def main() -> int:
-    """Run the groups, print their tables, write the JSON."""
+    """Measure the groups of the command line."""
     parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("group", nargs="?", choices=GROUPS, metavar="GROUP", help=", ".join(GROUPS) + "; all when left out")
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures to FILE")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions: the figures are rougher")
-    arguments = parser.parse_args()
-    if arguments.json:
-        new = not arguments.json.exists()
-        try:
-            arguments.json.open("a").close()  # before minutes of measuring
-            if new:
-                arguments.json.unlink()
-        except OSError as error:
-            parser.error(f"--json {arguments.json}: cannot be written: {error.strerror}")
+    parser.parse_args()
     enter()
     leave_quietly_on_interrupt()
+    from perch_eval.arguments import command
+
+    return command(lambda: parser, measure)()
+
+
+def measure(arguments: argparse.Namespace) -> int:
+    """Run the groups, print their tables, write the JSON."""
     sys.path.insert(0, str(ROOT / "bench"))
     sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "oracles")]  # the closed loop and the oracles of the tests
     import harness
     from perch_core.json_values import write_json
-    from perch_eval.revision import code_version, command_line
+    from perch_eval.arguments import output_file
 
-    code = code_version() if arguments.json else {}
-    results, failed = {}, False
-    for group in [arguments.group] if arguments.group else GROUPS:
-        print(f"== {group}", flush=True)
-        try:
-            results[group] = importlib.import_module(group).figures(arguments.quick)  # bench/<group>.py
-        except KeyboardInterrupt:  # in a node's wait
-            return INTERRUPTED
-        except Exception as error:  # a group that breaks must not hide the figures of the others
-            print(f"error: {group}: {type(error).__name__}: {error}", file=sys.stderr)
-            failed = True
-            continue
-        print(harness.table(results[group]), flush=True)
-        failed |= any(item.holds is False for item in results[group])
-    if arguments.json:
-        seeds = {group: sys.modules[group].SEEDS for group in results}
-        write_json(arguments.json, harness.as_json(results, code, command_line(), seeds))
-    return 1 if failed else 0
+    results, seeds, errors = {}, {}, {}
+    with output_file(arguments.json.absolute(), "--json") if arguments.json else nullcontext() as draft:
+        begun = harness.provenance()  # the load is that of others
+        for group in [arguments.group] if arguments.group else GROUPS:
+            print(f"== {group}", flush=True)
+            try:
+                module = importlib.import_module(group)  # bench/<group>.py
+                results[group], seeds[group] = module.figures(arguments.quick), module.SEEDS
+            except Exception as error:  # a group that breaks must not hide the figures of the others
+                errors[group] = f"{type(error).__name__}: {error}"
+                print(f"error: {group}: {errors[group]}", file=sys.stderr)
+                continue
+            print(harness.table(results[group]), flush=True)
+        if draft:
+            write_json(draft, begun | {"seeds": seeds, "errors": errors, "figures": harness.as_json(results)})
+    return 1 if errors or any(item.holds is False for items in results.values() for item in items) else 0
 
 
 if __name__ == "__main__":

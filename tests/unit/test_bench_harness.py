@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import math
 import os
 import signal
@@ -43,12 +44,77 @@ def test_measure_counts_only_after_the_warm_up():
 
 def test_json_and_table_name_every_figure():
     items = [harness.figure("plan", "ms", [0.3], bar=0.5), harness.figure("import", "s", [1.0])]
-    written = harness.as_json({"planner": items}, {"commit": "1234567", "digest": "0123456789ab"}, "python3 scripts/bench.py", {"planner": "from 0"})
-    assert written["machine"]["cores"] >= 1 and (written["commit"], written["digest"]) == ("1234567", "0123456789ab")
-    assert written["command"] == "python3 scripts/bench.py" and written["seeds"] == {"planner": "from 0"}
-    assert [f["name"] for f in written["figures"]] == ["plan", "import"]
-    assert {"name", "unit", "median", "p99", "n", "bar", "holds"} <= set(written["figures"][0])
+    written = harness.as_json({"planner": items})
+    assert [(one["group"], one["name"]) for one in written] == [("planner", "plan"), ("planner", "import")]
+    assert {"name", "unit", "median", "p99", "n", "bar", "holds"} <= set(written[0])
     assert "holds" in harness.table(items) and "import" in harness.table(items)
+
+
+def test_a_results_file_names_code_command_and_machine(monkeypatch):
+    monkeypatch.setattr(harness, "code_version", lambda: {"commit": "1234567", "digest": "0123456789ab"})
+    monkeypatch.setattr(sys, "argv", ["scripts/bench.py", "sim"])
+    found = harness.provenance()
+    assert (found["commit"], found["digest"], found["command"]) == ("1234567", "0123456789ab", "python3 scripts/bench.py sim")
+    assert found["machine"]["cores"] >= 1 and found["machine"]["cpu"]
+
+
+# -- the planner's campaign ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def campaign(monkeypatch):
+    """`bench/planner_campaign.py`, in which problems are numbers, and a plan of one has as many findings; a negative one cannot be planned."""
+    module = importlib.import_module("planner_campaign")
+
+    def plan(problem, *_):
+        if problem == 7:
+            raise ZeroDivisionError("of the planner")
+        return SimpleNamespace(duration=1.0, trajectory=SimpleNamespace(durations=problem, coefficients=None))
+
+    def verify(problem, *_):
+        if problem == 8:
+            raise ZeroDivisionError("of the verifier")
+        return [SimpleNamespace(requirement="thrust", excess=1.0, time=0.5)] * (problem == 9)
+
+    for name, value in {"plan": plan, "verify": verify, "requirements": lambda *_: None, "random_problem": lambda rng: rng.seed,
+                        "np": SimpleNamespace(**vars(np) | {"random": SimpleNamespace(default_rng=lambda seed: SimpleNamespace(seed=seed))})}.items():
+        monkeypatch.setattr(module, name, value)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield module
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("first, code, exceptions, findings", [
+    (1, 0, [], []), (6, 1, [7, 8], []), (8, 1, [8], [9])])
+def test_an_exception_of_planner_or_verifier_is_a_result_and_does_not_end_the_campaign(campaign, tmp_path, first, code, exceptions, findings):
+    assert campaign.main(["--first", str(first), "--count", "3", "--out", str(tmp_path / "new" / "out.json")]) == code
+    written = json.loads((tmp_path / "new" / "out.json").read_text())
+    assert written["problems"] == 3 and written["machine"]["cpu"]
+    assert [seed for seed, _ in written["exceptions"]] == exceptions and [seed for seed, *_ in written["findings_of_the_verifier"]] == findings
+
+
+def test_an_interrupted_campaign_writes_what_it_has(campaign, monkeypatch, tmp_path):
+    def interrupted(rng):
+        if rng.seed == 3:
+            raise KeyboardInterrupt
+        return rng.seed
+
+    monkeypatch.setattr(campaign, "random_problem", interrupted)
+    assert campaign.main(["--first", "1", "--out", str(tmp_path / "out.json")]) == 0
+    assert json.loads((tmp_path / "out.json").read_text())["problems"] == 2
+
+
+@pytest.mark.parametrize("words", [("--count", "0"), ("--first", "-1"), ("--step", "0"), ("--step", "nan"), ("--out", "/proc/none/out.json"), ("--out", ".")])
+def test_a_campaign_refuses_what_it_cannot_work_with(campaign, capsys, words):
+    try:
+        code = campaign.main([*words])
+    except SystemExit as end:
+        code = end.code
+    assert code == 2 and words[0] in capsys.readouterr().err.splitlines()[-1]
+
+
+# -- the machine -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("gap, touch, missing", [(None, False, math.inf), (10.0, False, math.inf), (0.5, False, math.nan), (None, True, math.nan)])

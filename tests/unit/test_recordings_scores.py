@@ -101,8 +101,6 @@ def test_the_page_is_that_of_its_figures(bench):
     assert page.partition(bench.INTRODUCTION)[2] == (folder / "README.md").read_text().rstrip("\n").partition(bench.INTRODUCTION)[2]
 
 
-def test_a_folder_that_does_not_exist_does_not_replace_the_page(bench, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(sys, "argv", ["recordings.py", str(tmp_path / "typo"), "--out", str(tmp_path / "out")])
-    with pytest.raises(SystemExit) as end:
-        bench.main()
-    assert end.value.code == 2 and "typo is no folder" in capsys.readouterr().err and not (tmp_path / "out").exists()
+def test_a_folder_that_does_not_exist_does_not_replace_the_page(bench, tmp_path, capsys):
+    assert bench.main([str(tmp_path / "typo"), "--out", str(tmp_path / "out")]) == 2
+    assert "typo: is no folder" in capsys.readouterr().err and not (tmp_path / "out").exists()
