@@ -1,7 +1,8 @@
 """Speed of the control laws: times of their steps.
 
-They fly on the plant of the tests (`tests/closed_loop`). A step's time is the processor time of its thread; wall-clock time,
-which depends on other load, is given beside it. Real-time deadlines: `bench.py ros`. Flights: `evaluate.py --only c_comparison`.
+They fly on the plant of the tests (`tests/closed_loop`). The time of an NMPC's step is the processor time of its thread; wall-clock
+time, which depends on other load, is given beside it, and alone for the geometric law, whose step is called again and again.
+Real-time deadlines: `bench.py ros`. Flights: `evaluate.py --only c_comparison`.
 """
 
 from __future__ import annotations
@@ -55,9 +56,9 @@ def figures(quick: bool) -> list[Figure]:
     """Times of a step, of the check of a contact, and of the NMPC in flight."""
     law, rotors = _geometric(), RotorEstimate((1260.0,) * 4, (1260.0,) * 4)
     state = (0.1, 0.0, 1.1, 0.2, 0.0, 0.0, 0.05, 0.0, 0.0, 0.99875, 0.1, 0.2, 0.0)
-    packed = FlatReference(perch("surface_90_1.7m").trajectory).setpoint(1.5).packed
-    step = measure(lambda: law.step(state, packed, rotors), repetitions=2000 if quick else 20000)
     source = FlatReference(perch("surface_90_1.7m").trajectory)
+    packed = source.setpoint(1.5).packed
+    step = measure(lambda: law.step(state, packed, rotors), repetitions=2000 if quick else 20000)
     check = measure(lambda: law.check_contact(source), repetitions=5 if quick else 50)
     out = [figure("geometric step", "us", 1e6 * step, bar=10.0), figure("check of a contact trajectory", "ms", 1e3 * check)]
     for states, bars in ((13, ((0.3, "median <="), (0.6, "p99 <="))), (17, ((1.5, "p99 <="),))):

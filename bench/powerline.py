@@ -66,7 +66,8 @@ def figures(quick: bool) -> list[Figure]:
     known = sum(oracle.perch(answer["request"]) is not None for answer in anywhere if answer["refusal"])
     sample = [oracle.perch(answer["request"]) is not None for answer in plans[::max(1, len(plans) // ORACLE_SAMPLE)]]
     out += [figure("starts anywhere, 0-180 deg, planned", "%", [100.0 * len(plans) / len(anywhere)]),
-            figure("the same, where a multi-start IPOPT plans", "%", [100.0 * len(plans) / (len(plans) + known)], bar=99.5, comparison="min >="),
+            figure("the same, of those that it or a multi-start IPOPT plans", "%", [100.0 * len(plans) / (len(plans) + known)], bar=99.5,
+                   comparison="min >="),
             figure("planned starts where that IPOPT plans", "%", [100.0 * np.mean(sample)]),
             figure("starts anywhere, without recovery", "-", [sum(np.isnan(plan["recovery_ms"]) for plan in plans)]),
             figure("starts anywhere, limits violated", "-", [sum(plan["violated"] for plan in plans)], bar=0, comparison="max =="),
