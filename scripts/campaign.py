@@ -6,4 +6,4 @@ import sys
 from perch_setup import run
 
 if __name__ == "__main__":
-    run("perch_eval.campaign.command", *["campaigns"] * any(word.startswith("--cluster") for word in sys.argv))
+    run("perch_eval.campaign.command", *["campaigns"] * any(word.startswith("--c") for word in sys.argv))  # argparse takes a part of --cluster, too

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -21,6 +22,7 @@ exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or fil
 
 def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
     from perch_core.json_values import write_json
+    from perch_eval.arguments import output_folder
     from perch_planner import plan_output
     from perch_planner.planner import plan
     from perch_planner.problem import Limits
@@ -30,7 +32,7 @@ def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
     problem, settings, vehicle = read_problem(mapping, source)
     plan(problem, settings, vehicle)  # loads the compiled kernels: the second plan is timed
     planned = plan(problem, settings, vehicle)
-    out.mkdir(parents=True, exist_ok=True)
+    output_folder(out)
     plan_output.write_csv(out / "plan.csv", planned, vehicle.mass)
     write_json(out / "plan.json", plan_output.as_json(planned))
     plan_output.draw(out / "plan.png", planned, problem, Limits.of(settings, vehicle), vehicle)
@@ -47,11 +49,12 @@ def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
 
 def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool) -> int:
     from perch_core import config
+    from perch_eval.arguments import output_folder
     from perch_planner.powerline import problem
     from perch_planner.powerline.report import write_report
 
     planned = problem.plan(config.from_mapping(problem.PowerlineProblem, mapping, source))
-    written = write_report(planned, out, animation)
+    written = write_report(planned, output_folder(out), animation)
     for name in ("perch", "recovery"):
         part = getattr(planned.plan, name)
         if part is not None:
@@ -85,7 +88,7 @@ def _apply(mapping: dict, changes: list[str]) -> None:
 
 
 def main() -> int:
-    """Read the problem, plan by its kind, write the files."""
+    """Plan what the command line names."""
     parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("problem", nargs="?", help="name in config/problems, or a YAML file")
     parser.add_argument("--out", type=Path, default=Path("out/plan"), help="folder for the results (default: %(default)s)")
@@ -97,39 +100,34 @@ def main() -> int:
         parser.error("a problem is needed; --list names those there are")
     enter()
     leave_quietly_on_interrupt()
-    from perch_core import config
-    from perch_core.errors import ConfigError, PerchError, PlanningRefusal
-    from perch_core.processes import discard_closed_output
+    from perch_eval.arguments import command
 
+    return command(lambda: parser, plan_file)()
+
+
+def plan_file(arguments: argparse.Namespace) -> int:
+    """Read the problem, plan by its kind, write the files."""
+    from perch_core import config
+    from perch_core.errors import ConfigError, PlanningRefusal
+
+    if arguments.list:
+        print("\n".join(sorted(path.stem for path in (config.config_dir() / "problems").glob("*.yaml"))))
+        return 0
+    path = config.find("problems", arguments.problem)
+    mapping = config.read_yaml(path)
+    kind = mapping.get("kind") if isinstance(mapping, dict) else mapping
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise ConfigError(str(path), "kind", f"{kind!r} is not one of {', '.join(KINDS)}")
+    mapping |= {key: config.beside(path, mapping[key]) for key in {"vehicle"} & set(mapping)}
+    _apply(mapping, arguments.set)
+    if arguments.animation and kind != "powerline":
+        raise ConfigError("--animation", kind, "only for powerline")
+    source = " ".join([str(path), *(f"--set {change}" for change in arguments.set)])
     try:
-        if arguments.list:
-            print("\n".join(sorted(path.stem for path in (config.config_dir() / "problems").glob("*.yaml"))))
-            return 0
-        path = config.find("problems", arguments.problem)
-        mapping = config.read_yaml(path)
-        if not isinstance(mapping, dict) or mapping.get("kind") not in KINDS:
-            kind = mapping.get("kind") if isinstance(mapping, dict) else mapping
-            raise ConfigError(str(path), "kind", f"{kind!r} is not one of {', '.join(KINDS)}")
-        mapping |= {key: config.beside(path, mapping[key]) for key in {"vehicle"} & set(mapping)}
-        _apply(mapping, arguments.set)
-        if arguments.animation and mapping["kind"] != "powerline":
-            raise ConfigError("--animation", mapping["kind"], "only for powerline")
-        source = " ".join([str(path), *(f"--set {change}" for change in arguments.set)])
-        code = KINDS[mapping["kind"]](mapping, source, arguments.out, arguments.animation)
-        sys.stdout.flush()
-        return code
+        return KINDS[kind](mapping, source, arguments.out, arguments.animation)
     except PlanningRefusal as refusal:
         print(f"refused ({refusal.code}): {refusal}", file=sys.stderr)
         return 2 if refusal.code == "bad_input" else 1
-    except PerchError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except BrokenPipeError:  # `plan.py ... | head`
-        discard_closed_output()
-        return 1
-    except OSError as error:
-        print(f"error: --out: {arguments.out}: cannot be written: {error.strerror}", file=sys.stderr)
-        return 2
 
 
 if __name__ == "__main__":

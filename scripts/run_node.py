@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 
-from perch_setup import ROOT, command_parser, enter, exec_program, quiet_on_interrupt
+from perch_setup import command_parser, enter, exec_program, quiet_on_interrupt
 
 EXAMPLES = """examples:
   python3 scripts/run_node.py vehicle
@@ -28,6 +28,7 @@ def main() -> int:
     arguments, for_node = parser.parse_known_args()
     enter(*["view"] * (arguments.node == "viewer"))
     with quiet_on_interrupt():
+        from perch_core.config import config_dir
         from perch_core.errors import PerchError
         from perch_eval.arguments import open_network
         from perch_eval.nodes import executable
@@ -39,10 +40,10 @@ def main() -> int:
             raise PerchError(f"node {arguments.node!r} is not one of {', '.join(packages)}")
         open_network(arguments.network)
         path = executable(packages[arguments.node], arguments.node)
+        file = config_dir() / f"{arguments.node}.yaml"
     except PerchError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    file = ROOT / "config" / f"{arguments.node}.yaml"
     with_file = ["--ros-args", "--params-file", str(file), "--"] if file.exists() and not arguments.no_config else []
     exec_program(path, [path, *with_file, *for_node])
 

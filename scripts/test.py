@@ -51,7 +51,7 @@ def main() -> int:
 
 
 def run_tests(quick: bool, fast: bool, for_pytest: list[str]) -> int:
-    """Run pytest with a reserved ROS domain, in this process or in several that share all tests or the quick ones."""
+    """Run pytest with a reserved ROS domain, in this process or, where none are named, in several that share them."""
     with quiet_on_interrupt():
         import pytest  # noqa: F401
         from perch_eval.domain import free_domain
@@ -62,7 +62,7 @@ def run_tests(quick: bool, fast: bool, for_pytest: list[str]) -> int:
     os.chdir(ROOT)
     chosen = ["-m", "quick", *["tests/unit"] * (not for_pytest)] if quick else ["--ignore=tests/system"] if fast else []
     processes = PROCESSES - 1 if quick else PROCESSES  # quick tests wait for nothing
-    if not fast and not for_pytest and PROCESSES > 2:
+    if not for_pytest and PROCESSES > 2:
         print(f"{processes} processes share the tests; what the others print comes at the end", flush=True)
         workers = WorkerPlugin(parts(test_files()), processes)
         workers.end(run_pytest([*chosen, "-o", "console_output_style=classic"], workers, *() if quick else (ForkServerPlugin(),)))

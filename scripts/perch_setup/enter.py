@@ -6,6 +6,7 @@ import argparse
 import importlib
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -55,7 +56,7 @@ def setting_up() -> Iterator[None]:
     except SetupError as error:
         print(f"perch: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except OSError as error:  # a full disk, files of another user
+    except (OSError, subprocess.CalledProcessError) as error:  # a full disk, files of another user, a numpy that cannot be loaded
         print(f"perch: set-up failed: {error}", file=sys.stderr)
         sys.exit(FAILED)
     except KeyboardInterrupt:

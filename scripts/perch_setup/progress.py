@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import time
@@ -73,7 +74,7 @@ class Step:
         self._shown = time.monotonic()
         text = f"perch set-up: {self._title}{': ' + detail if detail else ' ...'}"
         if self._terminal:
-            sys.stderr.write(f"\r\033[K{text[:110]}" + ("\n" if final else ""))
+            sys.stderr.write(f"\r\033[K{text[:shutil.get_terminal_size().columns - 1]}" + ("\n" if final else ""))
         else:
             sys.stderr.write(text + "\n")
         sys.stderr.flush()

@@ -48,7 +48,7 @@ class Commands:
         """
         command = self._verbs.add_parser(name, help=about)
         command.set_defaults(handler=handler)
-        command.add_argument("--spin-time", type=float, default=5.0, metavar="S", help="wait at most so long for discovery [s] (default: 5)")
+        command.add_argument("--spin-time", type=positive, default=5.0, metavar="S", help="wait at most so long for discovery [s] (default: 5)")
         self._verbs.metavar = "|".join(self._verbs.choices)
         return command
 

@@ -454,10 +454,20 @@ def test_a_failing_tool_is_reported_with_its_last_lines_and_its_log(tmp_path, mo
     assert "first" in (tmp_path / "log" / "tool.log").read_text()
 
 
-def test_a_disk_that_is_full_or_of_another_user_ends_the_set_up_in_one_line(capsys):
+@pytest.mark.parametrize("error, words", [
+    (PermissionError(13, "Permission denied", "/work/.perch/lock"), "[Errno 13] Permission denied: '/work/.perch/lock'"),
+    (subprocess.CalledProcessError(1, "python"), "Command 'python' returned non-zero exit status 1.")])
+def test_a_disk_that_is_full_or_a_python_that_does_not_run_ends_the_set_up_in_one_line(capsys, error, words):
     with pytest.raises(SystemExit) as end, perch_setup.setting_up():
-        raise PermissionError(13, "Permission denied", "/work/.perch/lock")
-    assert end.value.code == 1 and capsys.readouterr().err == "perch: set-up failed: [Errno 13] Permission denied: '/work/.perch/lock'\n"
+        raise error
+    assert end.value.code == 1 and capsys.readouterr().err == f"perch: set-up failed: {words}\n"
+
+
+def test_progress_stays_on_one_line_of_a_narrow_terminal(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    progress.Step("building").show("x" * 100)
+    assert len(capsys.readouterr().err.removeprefix("\r\033[K")) == 39
 
 
 def test_a_second_set_up_waits_for_the_first(tmp_path, monkeypatch):

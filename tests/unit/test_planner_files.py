@@ -73,6 +73,13 @@ def test_the_script_says_what_is_wrong_by_word_and_exit_code(arguments, code, wo
     assert not (tmp_path / "never").exists()
 
 
+@pytest.mark.parametrize("content", ["kind: [perch]", "kind: hover", "- kind"])
+def test_the_script_names_the_kinds_there_are(content, tmp_path):
+    (tmp_path / "mine.yaml").write_text(content)
+    done = call_script("plan.py", str(tmp_path / "mine.yaml"))
+    assert done.returncode == 2 and "mine.yaml: kind: " in done.stderr and "is not one of perch, powerline" in done.stderr
+
+
 def test_the_script_ends_quietly_where_its_output_is_closed():
     reading, writing = os.pipe()
     os.close(reading)

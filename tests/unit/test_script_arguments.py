@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import bench
+import harness
 import pytest
 import service
 from perch_eval.arguments import output_folder
@@ -50,13 +52,12 @@ def run(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("name, arguments, words", [
-    ("bench", ("planner", "--json", "file/figures.json"), "--json file/figures.json: cannot be written: "),
-    ("bench", ("planner", "--json", "."), "--json .: cannot be written: "),
     ("start_stack", ("--ready-timeout", "nan"), "--ready-timeout nan is not > 0 s"),
     ("start_stack", ("--ready-timeout", "-1"), "--ready-timeout -1.0 is not > 0 s"),
     ("topic", ("hz", "/imu/data_raw", "--window", "-1"), "-1 is not >= 1"),
     ("topic", ("echo", "/odometry", "-n", "0"), "0 is not >= 1"),
     ("topic", ("pub", "/x", "std_msgs/msg/Empty", "--rate", "0"), "0 is not a number > 0"),
+    ("topic", ("list", "--spin-time", "nan"), "nan is not a number > 0"),
 ])
 def test_what_cannot_be_is_refused(run, capsys, name, arguments, words):
     with pytest.raises(SystemExit) as end:
@@ -66,7 +67,6 @@ def test_what_cannot_be_is_refused(run, capsys, name, arguments, words):
 
 
 @pytest.mark.parametrize("name, arguments", [
-    ("bench", ("planner", "--json", "figures.json")),
     ("start_stack", ("--ready-timeout", "20")),
     ("topic", ("hz", "/imu/data_raw", "--window", "500", "-n", "3")),
 ])
@@ -91,16 +91,48 @@ def test_a_name_that_does_not_exist_is_a_wrong_argument_and_silence_is_a_failure
     assert capsys.readouterr().err == f"error: {error}{advice}\n"
 
 
-def test_ctrl_c_in_a_benchmark_that_waits_for_nodes_ends_all_of_them(monkeypatch):
+@pytest.fixture
+def run_bench(monkeypatch):
+    """Runs `bench.py` with words of a command line; `sim` breaks, the other groups call a function."""
+    def run_(figures, *arguments: str) -> int:
+        monkeypatch.setattr(bench, "enter", lambda: None)
+        monkeypatch.setattr(bench, "leave_quietly_on_interrupt", lambda: None)
+        monkeypatch.setattr("importlib.import_module", lambda name: SimpleNamespace(
+            figures=(lambda quick: 1 / 0) if name == "sim" else figures, SEEDS=f"of {name}"))
+        monkeypatch.setattr(sys, "path", [*sys.path])
+        monkeypatch.setattr(sys, "argv", ["bench.py", *arguments])
+        return bench.main()
+
+    return run_
+
+
+def test_ctrl_c_in_a_benchmark_that_waits_for_nodes_ends_all_of_them(run_bench):
     def interrupted(quick):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench, "enter", lambda: None)
-    monkeypatch.setattr(bench, "leave_quietly_on_interrupt", lambda: None)
-    monkeypatch.setattr("importlib.import_module", lambda name: SimpleNamespace(figures=interrupted))
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setattr(sys, "argv", ["bench.py"])
-    assert bench.main() == 130
+    assert run_bench(interrupted) == 130
+
+
+def test_a_group_that_breaks_hides_no_figures_and_is_named_in_the_file(run_bench, tmp_path, capsys):
+    assert run_bench(lambda quick: [harness.figure("one", "ms", [1.0], bar=2.0)], "--json", str(tmp_path / "out.json")) == 1
+    written = json.loads((tmp_path / "out.json").read_text())
+    assert written["errors"] == {"sim": "ZeroDivisionError: division by zero"} and "error: sim: ZeroDivisionError" in capsys.readouterr().err
+    others = [group for group in bench.GROUPS if group != "sim"]
+    assert [one["group"] for one in written["figures"]] == others and written["seeds"] == {group: f"of {group}" for group in others}
+    assert written["machine"]["cores"] >= 1 and written["command"].startswith("python3 bench.py --json")
+
+
+@pytest.mark.parametrize("median, code", [(1.0, 0), (3.0, 1)])
+def test_a_benchmark_fails_where_a_required_value_is_not_met(run_bench, median, code):
+    assert run_bench(lambda quick: [harness.figure("one", "ms", [median], bar=2.0)], "planner") == code
+
+
+@pytest.mark.parametrize("file", ["file/figures.json", "."])
+def test_a_benchmark_whose_file_cannot_be_written_does_not_begin(run_bench, monkeypatch, tmp_path, capsys, file):
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    assert run_bench(None, "planner", "--json", file) == 2
+    assert f"error: --json: {Path(file).absolute()}: cannot be written: " in capsys.readouterr().err and os.listdir() == ["file"]
 
 
 # -- output ----------------------------------------------------------------------------------------------------------
@@ -123,7 +155,7 @@ class Became(Exception):
 
 
 @pytest.mark.parametrize("node, package", [("betaflight", "perch_autopilot"), ("mavlink", "perch_autopilot"), ("controller", "perch_control")])
-def test_every_node_can_be_started_without_the_ros2_command(node, package, monkeypatch):
+def test_every_node_can_be_started_without_the_ros2_command(node, package, monkeypatch, tmp_path):
     def exec_program(path: str, words: list[str]) -> None:
         raise Became(path, words)
 
@@ -134,10 +166,13 @@ def test_every_node_can_be_started_without_the_ros2_command(node, package, monke
     monkeypatch.setattr(script, "enter", lambda *_: None)
     monkeypatch.setattr(script, "exec_program", exec_program)
     monkeypatch.setattr(sys, "argv", ["run_node.py", node, "--ros-args", "-p", "link:=/dev/ttyACM0"])
+    monkeypatch.setenv("PERCH_CONFIG_DIR", str(tmp_path))
+    (tmp_path / f"{node}.yaml").touch()
     with pytest.raises(Became) as started:
         script.main()
     path, words = started.value.args
     assert Path(path).name == node and Path(path).parent.name == package and words[-1] == "link:=/dev/ttyACM0"
+    assert words[1:4] == ["--ros-args", "--params-file", str(tmp_path / f"{node}.yaml")]
 
 
 @pytest.mark.parametrize("closed, work, code, words", [

@@ -44,6 +44,18 @@ def test_the_quick_ones_of_a_file_are_those_of_this_file_only(monkeypatch, words
     assert script.run_tests(True, False, words) == chosen
 
 
+@pytest.mark.parametrize("quick, fast, chosen", [(False, False, []), (True, False, ["-m", "quick", "tests/unit"]), (False, True, ["--ignore=tests/system"])])
+def test_processes_share_what_is_chosen_by_an_option(monkeypatch, quick, fast, chosen):
+    monkeypatch.setattr(script, "PROCESSES", 3)
+    monkeypatch.setattr(script, "run_pytest", lambda arguments, *plugins: (arguments, type(plugins[0])))
+    monkeypatch.setattr(script.WorkerPlugin, "end", lambda self, code: sys.exit(code))
+    monkeypatch.setenv("ROS_DOMAIN_ID", "1")
+    monkeypatch.chdir(script.ROOT)
+    with pytest.raises(SystemExit) as end:
+        script.run_tests(quick, fast, [])
+    assert end.value.code == ([*chosen, "-o", "console_output_style=classic"], script.WorkerPlugin)
+
+
 PROGRAM = """
 import os, sys, pytest, test
 sys.first = os.getpid()
