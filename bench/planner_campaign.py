@@ -90,7 +90,7 @@ def campaign(arguments: argparse.Namespace) -> int:
         found = verify(answer.trajectory.durations, answer.trajectory.coefficients, requirements(problem, settings, vehicle), arguments.step)
         broken.extend([seed, finding.requirement, finding.excess, finding.time] for finding in found)
 
-    with output_file(arguments.out.absolute()) if arguments.out else nullcontext() as draft:
+    with output_file(arguments.out) if arguments.out else nullcontext() as draft:
         head, begin = harness.provenance(), time.time()
         try:
             with suppress(Exception):  # loads the compiled kernels, which is no part of a plan's time

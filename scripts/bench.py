@@ -44,7 +44,7 @@ def measure(arguments: argparse.Namespace) -> int:
     from perch_eval.arguments import output_file
 
     results, seeds, errors = {}, {}, {}
-    with output_file(arguments.json.absolute(), "--json") if arguments.json else nullcontext() as draft:
+    with output_file(arguments.json, "--json") if arguments.json else nullcontext() as draft:
         begun = harness.provenance()  # the load is that of others
         for group in [arguments.group] if arguments.group else GROUPS:
             print(f"== {group}", flush=True)

@@ -132,7 +132,7 @@ def test_a_benchmark_whose_file_cannot_be_written_does_not_begin(run_bench, monk
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     assert run_bench(None, "planner", "--json", file) == 2
-    assert f"error: --json: {Path(file).absolute()}: cannot be written: " in capsys.readouterr().err and os.listdir() == ["file"]
+    assert f"error: --json: {file}: cannot be written: " in capsys.readouterr().err and os.listdir() == ["file"]
 
 
 # -- output ----------------------------------------------------------------------------------------------------------

@@ -103,7 +103,7 @@ def output_file(path: Path, option: str = "--out") -> Iterator[Path]:
     Raises:
         ConfigError: the file cannot be written; as far as possible, this is found before the body is run.
     """
-    draft = path.with_name(f".{os.getpid()}-{path.name}")
+    draft = path.parent / f".{os.getpid()}-{path.name}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
