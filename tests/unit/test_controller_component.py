@@ -336,6 +336,9 @@ def too_long(flight):
     (many_coefficients, {}, "degree: 1099"), (with_rates, {}, "w: 1e+09"), (far_away, {}, "coefficients: 1e+300"), (in_no_time, {}, "durations"),
     (too_long, {}, "duration"), (lambda f: samples(f, q=np.tile([0.0, 0.0, 0.0, 0.9], (40, 1))), {}, "norm 0.9"),
     (lambda f: samples(f, rotor_thrust=np.full((40, 4), 1e6)), {}, "rotor_thrust"),
+    (lambda f: samples(f, q=np.tile([1.0, 0.0, 0.0, 0.0], (40, 1))), {}, "by 19.6 m/s^2"),  # wxyz
+    (lambda f: samples(f, rotor_thrust=2.2 * samples(f).rotor_thrust), {}, "by 11.8 m/s^2"),  # of other vehicles
+    (lambda f: samples(f, rotor_thrust=0.4 * samples(f).rotor_thrust), {}, "by 5.9 m/s^2"),
     (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=NAN), {}, "start_time"),
     (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=1e12), {}, "start_time"),
     (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=-1e12), {}, "start_time"),
