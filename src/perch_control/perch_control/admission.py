@@ -131,10 +131,10 @@ def check_joints(trajectory: FlatTrajectory | SampledTrajectory) -> None:
         steps = np.linalg.norm(np.diff(trajectory.p, axis=0) - mean * dt, axis=-1)
         kinks = np.linalg.norm(np.diff(trajectory.v, axis=0), axis=-1) - 60.0 * dt[:, 0]
         places = trajectory.times[1:]
-    if len(steps) and steps.max() > _STEP:
+    if len(steps) and not steps.max() <= _STEP:
         k = int(steps.argmax())
         raise TrajectoryRefused(f"position jumps by {steps[k]:.3f} m at {places[k]:.3f} s; at most {_STEP:g} m is allowed")
-    if len(kinks) and kinks.max() > 10.0 * _STEP:
+    if len(kinks) and not kinks.max() <= 10.0 * _STEP:
         k = int(kinks.argmax())
         raise TrajectoryRefused(f"velocity jumps by {kinks[k]:.3f} m/s at {places[k]:.3f} s; at most {10 * _STEP:g} m/s is allowed")
 
@@ -157,8 +157,8 @@ def check_start(order: Order, now: float, present: Setpoint) -> None:
         raise TrajectoryRefused(f"starts {-delay:.2f} s in the future; at most {_START_AHEAD_MAX:g} s is allowed")
     begin = order.source.setpoint(max(delay, 0.0))
     gap = float(np.linalg.norm(np.subtract(begin.p, present.p)))
-    if gap > START_GAP:
+    if not gap <= START_GAP:
         raise TrajectoryRefused(f"starts {gap:.2f} m away from the vehicle; at most {START_GAP:g} m is allowed")
     speed = float(np.linalg.norm(np.subtract(begin.v, present.v)))
-    if speed > _START_SPEED_GAP:
+    if not speed <= _START_SPEED_GAP:
         raise TrajectoryRefused(f"starts {speed:.2f} m/s from the vehicle's velocity; at most {_START_SPEED_GAP:g} m/s is allowed")
