@@ -319,6 +319,8 @@ class FlightController:
     def _fly(self, x: FlightState) -> tuple[FlightState, StepResult]:
         setpoint = self.supervisor.setpoint(x)
         contact = x.time_to_contact
+                if x.mode is State.HOVERING and x.elapsed > self.settings.silence_time and not self._schedule.waiting:
+                    x = landing(x, f"landing: no order for {self.settings.silence_time:.0f} s", self.settings.land_speed)
         state, delay = x.rotors.ahead(x.state_estimate, x.vehicle), x.rotors.delay
         reference = DelayedReference(x, delay) if delay > 0.0 else x
         out = self.law.control(state, reference, x.rotors.at_effect, self._compensation(x, contact), max(contact - delay, 0.0))
