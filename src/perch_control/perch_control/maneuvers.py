@@ -58,8 +58,8 @@ def tracked(x: FlightState, order: Order, source: Source, leaving: str = "") -> 
     contact = {AtEnd.CONTACT: order.source.duration, AtEnd.RECOVER: order.recovery_start}.get(order.at_end, -1.0)
     # A way out keeps the contact of its trajectory: it leads to no other one.
     planned_contact = (order.start + contact, order.source.setpoint(contact).p) if contact >= 0.0 else x.planned_contact
-    return x._replace(attached_to=None, order=order, source=source, start=order.start, trajectory_id=order.id,
-                      planned_contact=planned_contact)
+    return x._replace(attached_to=None, airborne=x.airborne or x.attached_to is not None, order=order, source=source,
+                      start=order.start, trajectory_id=order.id, planned_contact=planned_contact)
 
 
 def motors_off(x: FlightState, mode: State, message: str) -> FlightState:
@@ -105,7 +105,8 @@ def hover_after_recovery(x: FlightState, message: str) -> FlightState:
 def recovered(x: FlightState, message: str) -> FlightState:
     """Return to a hover from any attitude; from a surface, push off first."""
     guidance = Recovery(x.specific_thrust_max, x.state_estimate, x.surface_normal or x.attached_to)
-    return following(entered(x, State.RECOVERING, f"recovering: {message}"), guidance)._replace(attached_to=None)
+    return following(entered(x, State.RECOVERING, f"recovering: {message}"), guidance)._replace(
+        attached_to=None, airborne=x.airborne or x.attached_to is not None)
 
 
 def landing(x: FlightState, message: str, speed: float) -> FlightState:
