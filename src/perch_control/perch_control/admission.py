@@ -16,7 +16,7 @@ from perch_core.values import AtEnd, TrajectoryOrder, limits
 from perch_core.vehicle import GRAVITY, Vehicle
 
 _START_AHEAD_MAX = 60.0  # a trajectory is not kept for longer before its start [s]
-START_DELAY_MAX = 0.5   # a trajectory is not flown where its start lies further in the past [s]
+_START_DELAY_MAX = 0.5  # a trajectory is not flown where its start lies further in the past [s]
 START_GAP = 0.35        # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
 CONTACT_EARLY = 0.15    # a contact may occur so long before the planned one [s]
 _START_SPEED_GAP = 1.0  # the same for the velocity [m/s]
@@ -151,8 +151,8 @@ def check_start(order: Order, now: float, present: Setpoint) -> None:
         TrajectoryRefused: with the gap and its limit.
     """
     delay = now - order.start
-    if delay > START_DELAY_MAX:
-        raise TrajectoryRefused(f"starts {delay:.2f} s in the past; at most {START_DELAY_MAX:g} s is allowed")
+    if delay > _START_DELAY_MAX:
+        raise TrajectoryRefused(f"starts {delay:.2f} s in the past; at most {_START_DELAY_MAX:g} s is allowed")
     if -delay > _START_AHEAD_MAX:
         raise TrajectoryRefused(f"starts {-delay:.2f} s in the future; at most {_START_AHEAD_MAX:g} s is allowed")
     begin = order.source.setpoint(max(delay, 0.0))
