@@ -58,6 +58,7 @@ class FlightController:
         self._schedule = Schedule()
         self._thrust = ThrustModel(vehicle)
         self._inputs = SensorInputs()
+        self._estimator_problem = ""  # of its last status; empty: none
         self._period = MeasuredPeriod()
         law.begin()
 
@@ -190,6 +191,8 @@ class FlightController:
             raise TrajectoryRefused("the vehicle is being braked to a hover")
         if x.mode is State.HOVERING and order.at_end is not AtEnd.HOLD and x.spare < _MARGIN_PERCH:
             raise TrajectoryRefused(f"the thrust margin in hover is {x.spare:.2f}; a perch needs {_MARGIN_PERCH:g}")
+        elif x.mode is State.ARMED and self._estimator_problem:
+            raise TrajectoryRefused(self._estimator_problem)
         check_joints(order.source.trajectory)
         check_start(order, x.now, x.expected(max(order.start, x.now)))
         if order.at_end is AtEnd.CONTACT:
@@ -236,11 +239,12 @@ class FlightController:
     def estimator(self, state: int, vio_age: float, message: str) -> None:
         """Act on the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
         if state == _DIVERGED:
-            self.descend(f"the estimator has diverged: {message}", moving=False)
+            self.descend(problem, moving=False)
         elif state == _COASTING and vio_age > _COASTING_LAND:
-            self.descend(f"no VIO for {vio_age:.1f} s")
+            self.descend(problem)
         elif state == _COASTING and vio_age > _COASTING_HOVER:
-            self.flight_state = self._leave_or_brake(self.flight_state, f"no VIO for {vio_age:.1f} s")
+            self.flight_state = self._leave_or_brake(self.flight_state, problem)
+        self._estimator_problem = problem
 
     def _leave_or_brake(self, x: FlightState, reason: str) -> FlightState:
         """Leave a trajectory by a planned way out, or brake; continue where even the hardest brake would end in the surface."""
@@ -249,6 +253,7 @@ class FlightController:
         return self._schedule.leave_by_way_out(x, reason) or (x if committed(x) else self._brake_to_hover(x, f"hover: {reason}"))
 
     def descend(self, message: str, moving: bool = True) -> None:
+        problem = {_DIVERGED: f"the estimator has diverged: {message}", _COASTING: f"no VIO for {vio_age:.1f} s"}.get(state, "")
         """Begin a descent without position; `moving`: whether the last velocity is trusted."""
         self.flight_state = self._descending(self.flight_state, message, moving)
 
