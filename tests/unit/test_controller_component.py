@@ -18,7 +18,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
     NANOSECONDS, AtEnd, Command, ControllerCommand, EstimatorHealth, MappedPowerline, PowerlineMap, SetControllerRequest,
-    TrajectoryOrder, Transform, TriggerRequest)
+    TrajectoryOrder, Transform, TriggerRequest, TriggerResponse)
 from perch_core.vehicle import load_vehicle
 from unit.controller_flight import START, Flight, hovering, parameters
 
@@ -549,6 +549,14 @@ def test_abort_brakes_to_a_hover():
     assert answer.success and "abort" in answer.message
     flight.step(1.5)
     assert flight.state is State.HOVERING and np.linalg.norm(flight.plant.v) < 0.05 and flight.plant.p[0] < 2.6
+
+
+@pytest.mark.parametrize("command, success, message", [
+    (Command.LAND, True, "already landing: landing: test"), (Command.KILL, False, "abort is refused: killed: test")])
+def test_abort_answers_what_is_done(command, success, message):
+    flight = hovering()
+    flight.order(command)
+    assert ask(flight.component, "abort", TriggerRequest()) == TriggerResponse(success, message)
 
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs/howto/own_controller.md"

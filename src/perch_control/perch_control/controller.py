@@ -243,7 +243,10 @@ class Controller(Component[ControllerParameters]):
 
     def on_abort(self, request: TriggerRequest, reply) -> None:
         """End the running manoeuvre in a hover."""
-        reply(TriggerResponse(True, self.flight.abort()))
+        try:
+            reply(TriggerResponse(True, self.flight.abort()))
+        except CommandRefused as error:
+            reply(TriggerResponse(False, str(error)))
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 

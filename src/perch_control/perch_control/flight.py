@@ -210,7 +210,11 @@ class FlightController:
         self._schedule.keep_ready(self.flight_state, order)
 
     def abort(self, reason: str = "abort was requested") -> str:
-        """End the running manoeuvre in a hover, by a recovery where the vehicle is tilted. Returns a message on what is done."""
+        """End the running manoeuvre in a hover, by a recovery where the vehicle is tilted. Return what is done.
+
+        Raises:
+            CommandRefused: the motors are off, so that there is nothing to end.
+        """
         x = self.flight_state
         if x.mode in (State.TRACKING, State.HOVERING):
             self.flight_state = self._end_maneuver(x, reason)
@@ -218,6 +222,10 @@ class FlightController:
             self._schedule.clear()
             self.flight_state = x._replace(message=f"{reason}; no manoeuvre is running")
         return self.flight_state.message
+        if x.mode in (State.DISARMED, State.FAILED):
+            raise CommandRefused(f"abort is refused: {x.message}")
+        if x.mode in (State.RECOVERING, State.LANDING):
+            return f"already {x.mode.name.lower()}: {x.message}"
 
     def _end_maneuver(self, x: FlightState, reason: str) -> FlightState:
         """End the running manoeuvre: by the next planned way out, or at once."""
