@@ -11,7 +11,7 @@
 | `landing` | LANDING | a brake into a descent | geofence, rotors at their limit, no order for too long |
 | `landing_weak` | LANDING | guidance by the state | weak rotors |
 | `descending` | LANDING, `blind` | none | no position |
-| `attached` | ATTACHED | none | command of the mission: the surface holds the vehicle |
+| `attached` | ATTACHED | a hold at the place | command of the mission: the surface holds the vehicle |
 | `motors_off` | DISARMED, FAILED | none | on the ground, killed, neither odometry nor IMU |
 """
 
@@ -68,9 +68,10 @@ def motors_off(x: FlightState, mode: State, message: str) -> FlightState:
 
 
 def attached(x: FlightState, message: str) -> FlightState:
-    """Stop the motors on a surface that carries the vehicle."""
-    normal = x.surface_normal or axes_of(x.state_estimate[6:10])[2]
-    return motors_off(x, State.ATTACHED, message)._replace(attached_to=normal)
+    """Stop the motors on a surface that carries the vehicle, and keep the place as reference."""
+    _, b2, b3 = axes_of(x.state_estimate[6:10])
+    place = following(motors_off(x, State.ATTACHED, message), Hold.at(x.state_estimate[0:3], b2))
+    return place._replace(attached_to=x.surface_normal or b3)
 
 
 def stopped(x: FlightState, message: str) -> FlightState:
