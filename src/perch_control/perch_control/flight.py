@@ -252,14 +252,15 @@ class FlightController:
 
     def estimator(self, state: int, vio_age: float, message: str) -> None:
         """Act on the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
-        problem = {_DIVERGED: f"the estimator has diverged: {message}", _COASTING: f"no VIO for {vio_age:.1f} s"}.get(state, "")
-        if state == _DIVERGED:
-            self.descend(problem, moving=False)
-        elif state == _COASTING and vio_age > _COASTING_LAND:
-            self.descend(problem)
-        elif state == _COASTING and vio_age > _COASTING_HOVER:
-            self.flight_state = self._leave_or_brake(self.flight_state, problem)
+        diverged, coasting = state == _DIVERGED, state == _COASTING and vio_age > _COASTING_HOVER
+        problem = f"the estimator has diverged: {message}" if diverged else f"no VIO for {vio_age:.1f} s" if coasting else ""
         self._estimator_problem = problem
+        if diverged:
+            self.descend(problem, moving=False)
+        elif coasting and vio_age > _COASTING_LAND:
+            self.descend(problem)
+        elif coasting:
+            self.flight_state = self._leave_or_brake(self.flight_state, problem)
 
     def _leave_or_brake(self, x: FlightState, reason: str) -> FlightState:
         """Leave a trajectory by a planned way out, or brake; continue where even the hardest brake would end in the surface."""
