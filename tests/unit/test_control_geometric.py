@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from oracles import rigid_body
+from perch_control.admission import TrajectoryRefused
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.geometric.controller import CONE_DEG
 from perch_control.geometric.law import attitude_error, geometric_step
@@ -305,3 +306,11 @@ def test_a_carried_attitude_changes_nothing_where_the_force_shows_it():
             np.testing.assert_allclose(a, b, atol=1e-9)
         compared += 1
     assert compared > 5
+
+
+def test_a_contact_whose_simulation_has_no_result_is_refused():
+    """Thrust along the heading b2 determines no attitude."""
+    c = np.zeros((1, 4, 3))
+    c[0, 1, 2], c[0, 2, 2] = 0.5 * 5.0, -0.5 * 9.81
+    with pytest.raises(TrajectoryRefused, match="misses the contact"):
+        GeometricController(VEHICLE, VEHICLE.gains).check_contact(FlatReference(FlatTrajectory(np.ones(1), c)))

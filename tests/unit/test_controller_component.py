@@ -18,7 +18,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
     NANOSECONDS, AtEnd, Command, ControllerCommand, EstimatorHealth, MappedPowerline, PowerlineMap, SetControllerRequest,
-    TrajectoryOrder, Transform, TriggerRequest)
+    TrajectoryOrder, Transform, TriggerRequest, TriggerResponse)
 from perch_core.vehicle import load_vehicle
 from unit.controller_flight import START, Flight, hovering, parameters
 
@@ -336,6 +336,9 @@ def too_long(flight):
     (many_coefficients, {}, "degree: 1099"), (with_rates, {}, "w: 1e+09"), (far_away, {}, "coefficients: 1e+300"), (in_no_time, {}, "durations"),
     (too_long, {}, "duration"), (lambda f: samples(f, q=np.tile([0.0, 0.0, 0.0, 0.9], (40, 1))), {}, "norm 0.9"),
     (lambda f: samples(f, rotor_thrust=np.full((40, 4), 1e6)), {}, "rotor_thrust"),
+    (lambda f: samples(f, q=np.tile([1.0, 0.0, 0.0, 0.0], (40, 1))), {}, "by 19.6 m/s^2"),  # wxyz
+    (lambda f: samples(f, rotor_thrust=2.2 * samples(f).rotor_thrust), {}, "by 11.8 m/s^2"),  # of other vehicles
+    (lambda f: samples(f, rotor_thrust=0.4 * samples(f).rotor_thrust), {}, "by 5.9 m/s^2"),
     (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=NAN), {}, "start_time"),
     (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=1e12), {}, "start_time"),
     (lambda f: replace(f.path((0, 0, 0.6), (1, 0, 0.6), 2.0), start_time=-1e12), {}, "start_time"),
@@ -546,6 +549,14 @@ def test_abort_brakes_to_a_hover():
     assert answer.success and "abort" in answer.message
     flight.step(1.5)
     assert flight.state is State.HOVERING and np.linalg.norm(flight.plant.v) < 0.05 and flight.plant.p[0] < 2.6
+
+
+@pytest.mark.parametrize("command, success, message", [
+    (Command.LAND, True, "already landing: landing: test"), (Command.KILL, False, "abort is refused: killed: test")])
+def test_abort_answers_what_is_done(command, success, message):
+    flight = hovering()
+    flight.order(command)
+    assert ask(flight.component, "abort", TriggerRequest()) == TriggerResponse(success, message)
 
 
 GUIDE = Path(__file__).resolve().parents[2] / "docs/howto/own_controller.md"

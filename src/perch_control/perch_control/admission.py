@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 
 from perch_control.reference import FlatReference, SampledReference, Setpoint
 from perch_core import bernstein
 from perch_core.errors import PerchError
+from perch_core.so3 import quat_rotate
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import AtEnd, TrajectoryOrder, limits
-from perch_core.vehicle import Vehicle
+from perch_core.vehicle import GRAVITY, Vehicle
 
 _START_AHEAD_MAX = 60.0  # a trajectory is not kept for longer before its start [s]
-START_DELAY_MAX = 0.5   # a trajectory is not flown where its start lies further in the past [s]
+_START_DELAY_MAX = 0.5  # a trajectory is not flown where its start lies further in the past [s]
 START_GAP = 0.35        # largest distance between a trajectory's start and the vehicle, which feedback closes [m]
 CONTACT_EARLY = 0.15    # a contact may occur so long before the planned one [s]
 _START_SPEED_GAP = 1.0  # the same for the velocity [m/s]
 _PLACES = np.linspace(0.0, 1.0, 21)  # of a segment, where a polynomial is evaluated
 _STEP = 0.02            # largest step inside a trajectory [m]; ten times this for the velocity [m/s]
+_MOTION_TIME = 0.05     # over so long, samples change their velocity as their attitudes and thrusts do, [s] ...
+_MOTION_GAP = 3.0       # ... within this acceleration: more than the drag that a plan may contain [m/s^2]
 
 
 class TrajectoryRefused(PerchError):
@@ -78,12 +82,29 @@ def _check_polynomials(trajectory: FlatTrajectory) -> None:
 
 
 def _check_samples(trajectory: SampledTrajectory, vehicle: Vehicle) -> None:
-    """Refuse quaternions that are not of unit length, and rotor thrusts above twice the vehicle's greatest."""
+    """Refuse quaternions that are not of unit length, rotor thrusts above twice the vehicle's greatest, and a motion that does not
+    follow from both on this vehicle."""
     norms = np.linalg.norm(trajectory.q, axis=-1)
     if not np.abs(norms - 1.0).max() <= 1e-3:
         k = int(np.abs(norms - 1.0).argmax())
         raise TrajectoryRefused(f"quaternion of sample {k} has norm {norms[k]:.4f}, not 1")
     _check_size("rotor thrust", trajectory.rotor_thrust, 2.0 * vehicle.thrust_max)
+    _check_motion(trajectory, vehicle.mass)
+
+
+def _check_motion(trajectory: SampledTrajectory, mass: float) -> None:
+    """Refuse samples whose velocity does not change as m dv/dt = f b3 - m g e3 says, as those with quaternions in another order."""
+    t, e3 = trajectory.times, np.array([0.0, 0.0, 1.0])
+    a = trajectory.rotor_thrust.sum(axis=1, keepdims=True) / mass * quat_rotate(trajectory.q, e3) - GRAVITY * e3
+    gained = np.cumsum(0.5 * (a[1:] + a[:-1]) * np.diff(t)[:, None], axis=0)
+    gap = trajectory.v - np.concatenate([np.zeros((1, 3)), gained])
+    grid = np.linspace(0.0, t[-1], ceil(t[-1] / _MOTION_TIME) + 1)
+    steps = np.diff(np.stack([np.interp(grid, t, column) for column in gap.T], axis=1), axis=0)
+    gaps = np.linalg.norm(steps, axis=1) / _MOTION_TIME
+    if not gaps.max() <= _MOTION_GAP:
+        k = int(gaps.argmax())
+        raise TrajectoryRefused(f"attitude and thrusts give another acceleration than the velocity, by {gaps[k]:.1f} m/s^2 at {grid[k]:.3f} s; "
+                                f"at most {_MOTION_GAP:g} m/s^2 is allowed")
 
 
 def _check_size(name: str, values: np.ndarray, limit: float) -> None:
@@ -110,10 +131,10 @@ def check_joints(trajectory: FlatTrajectory | SampledTrajectory) -> None:
         steps = np.linalg.norm(np.diff(trajectory.p, axis=0) - mean * dt, axis=-1)
         kinks = np.linalg.norm(np.diff(trajectory.v, axis=0), axis=-1) - 60.0 * dt[:, 0]
         places = trajectory.times[1:]
-    if len(steps) and steps.max() > _STEP:
+    if len(steps) and not steps.max() <= _STEP:
         k = int(steps.argmax())
         raise TrajectoryRefused(f"position jumps by {steps[k]:.3f} m at {places[k]:.3f} s; at most {_STEP:g} m is allowed")
-    if len(kinks) and kinks.max() > 10.0 * _STEP:
+    if len(kinks) and not kinks.max() <= 10.0 * _STEP:
         k = int(kinks.argmax())
         raise TrajectoryRefused(f"velocity jumps by {kinks[k]:.3f} m/s at {places[k]:.3f} s; at most {10 * _STEP:g} m/s is allowed")
 
@@ -130,14 +151,14 @@ def check_start(order: Order, now: float, present: Setpoint) -> None:
         TrajectoryRefused: with the gap and its limit.
     """
     delay = now - order.start
-    if delay > START_DELAY_MAX:
-        raise TrajectoryRefused(f"starts {delay:.2f} s in the past; at most {START_DELAY_MAX:g} s is allowed")
+    if delay > _START_DELAY_MAX:
+        raise TrajectoryRefused(f"starts {delay:.2f} s in the past; at most {_START_DELAY_MAX:g} s is allowed")
     if -delay > _START_AHEAD_MAX:
         raise TrajectoryRefused(f"starts {-delay:.2f} s in the future; at most {_START_AHEAD_MAX:g} s is allowed")
     begin = order.source.setpoint(max(delay, 0.0))
     gap = float(np.linalg.norm(np.subtract(begin.p, present.p)))
-    if gap > START_GAP:
+    if not gap <= START_GAP:
         raise TrajectoryRefused(f"starts {gap:.2f} m away from the vehicle; at most {START_GAP:g} m is allowed")
     speed = float(np.linalg.norm(np.subtract(begin.v, present.v)))
-    if speed > _START_SPEED_GAP:
+    if not speed <= _START_SPEED_GAP:
         raise TrajectoryRefused(f"starts {speed:.2f} m/s from the vehicle's velocity; at most {_START_SPEED_GAP:g} m/s is allowed")

@@ -243,7 +243,10 @@ class Controller(Component[ControllerParameters]):
 
     def on_abort(self, request: TriggerRequest, reply) -> None:
         """End the running manoeuvre in a hover."""
-        reply(TriggerResponse(True, self.flight.abort()))
+        try:
+            reply(TriggerResponse(True, self.flight.abort()))
+        except CommandRefused as error:
+            reply(TriggerResponse(False, str(error)))
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 
@@ -297,7 +300,8 @@ class Controller(Component[ControllerParameters]):
     def _diagnose(self, stamp: int) -> None:
         flight = self.flight
         values = {"state": flight.state.name, "controller": flight.law_name, "steps": self._steps,
-                  "odometry_age_s": float(min(flight.odometry_age, 1e6)), "rotor_ratio": flight.health.ratio}
+                  "odometry_age_s": float(min(flight.odometry_age, 1e6)), "rotor_ratio": flight.health.ratio,
+                  "law_failures": flight.law.failures}
         level = 2 if flight.state is State.FAILED else 1 if flight.health.weak or flight.state in (State.RECOVERING, State.LANDING) else 0
         self.diagnostics(Diagnostics(stamp, values, level, flight.flight_state.message))
 

@@ -33,7 +33,8 @@ class FlightState(NamedTuple):
         planned_contact: time and position of the planned contact with a surface or a wire [s, m]; None: there is none.
         attached_to: normal of the surface that carries the vehicle; None: there is none.
         blind: the running descent without position; None: there is none.
-        ground: height at which the vehicle was armed [m]; `airborne`: whether it has been clear of the ground since.
+        ground: height at which the vehicle was armed [m]; `airborne`: whether it has been clear of the ground since, or has
+            left a perch.
         land_requested: whether a landing was commanded or interrupted; a hover then becomes a landing.
         left_early: whether a trajectory was left before its end; no perch begins during the brake.
         events: events since the last step, for the log.

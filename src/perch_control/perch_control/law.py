@@ -46,10 +46,12 @@ class Law(ABC):
         slow: whether building it takes seconds; it is then built in the background.
         vehicle: the vehicle model in use.
         period: period of the odometry [s].
+        failures: steps in which it has fallen back to another law.
     """
 
     name: ClassVar[str]
     slow: ClassVar[bool] = False
+    failures: int = 0
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle, self.period = vehicle, NOMINAL_PERIOD

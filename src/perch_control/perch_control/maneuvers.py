@@ -11,7 +11,7 @@
 | `landing` | LANDING | a brake into a descent | geofence, rotors at their limit, no order for too long |
 | `landing_weak` | LANDING | guidance by the state | weak rotors |
 | `descending` | LANDING, `blind` | none | no position |
-| `attached` | ATTACHED | none | command of the mission: the surface holds the vehicle |
+| `attached` | ATTACHED | a hold at the place | command of the mission: the surface holds the vehicle |
 | `motors_off` | DISARMED, FAILED | none | on the ground, killed, neither odometry nor IMU |
 """
 
@@ -58,8 +58,8 @@ def tracked(x: FlightState, order: Order, source: Source, leaving: str = "") -> 
     contact = {AtEnd.CONTACT: order.source.duration, AtEnd.RECOVER: order.recovery_start}.get(order.at_end, -1.0)
     # A way out keeps the contact of its trajectory: it leads to no other one.
     planned_contact = (order.start + contact, order.source.setpoint(contact).p) if contact >= 0.0 else x.planned_contact
-    return x._replace(attached_to=None, order=order, source=source, start=order.start, trajectory_id=order.id,
-                      planned_contact=planned_contact)
+    return x._replace(attached_to=None, airborne=x.airborne or x.attached_to is not None, order=order, source=source,
+                      start=order.start, trajectory_id=order.id, planned_contact=planned_contact)
 
 
 def motors_off(x: FlightState, mode: State, message: str) -> FlightState:
@@ -68,9 +68,10 @@ def motors_off(x: FlightState, mode: State, message: str) -> FlightState:
 
 
 def attached(x: FlightState, message: str) -> FlightState:
-    """Stop the motors on a surface that carries the vehicle."""
-    normal = x.surface_normal or axes_of(x.state_estimate[6:10])[2]
-    return motors_off(x, State.ATTACHED, message)._replace(attached_to=normal)
+    """Stop the motors on a surface that carries the vehicle, and keep the place as reference."""
+    _, b2, b3 = axes_of(x.state_estimate[6:10])
+    place = following(motors_off(x, State.ATTACHED, message), Hold.at(x.state_estimate[0:3], b2))
+    return place._replace(attached_to=x.surface_normal or b3)
 
 
 def stopped(x: FlightState, message: str) -> FlightState:
@@ -105,7 +106,8 @@ def hover_after_recovery(x: FlightState, message: str) -> FlightState:
 def recovered(x: FlightState, message: str) -> FlightState:
     """Return to a hover from any attitude; from a surface, push off first."""
     guidance = Recovery(x.specific_thrust_max, x.state_estimate, x.surface_normal or x.attached_to)
-    return following(entered(x, State.RECOVERING, f"recovering: {message}"), guidance)._replace(attached_to=None)
+    return following(entered(x, State.RECOVERING, f"recovering: {message}"), guidance)._replace(
+        attached_to=None, airborne=x.airborne or x.attached_to is not None)
 
 
 def landing(x: FlightState, message: str, speed: float) -> FlightState:

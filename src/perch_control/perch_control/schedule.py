@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import dist, inf
 
-from perch_control.admission import START_DELAY_MAX, START_GAP, AtEnd, Order, check_joints
+from perch_control.admission import START_GAP, AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.flight_state import FlightState
 from perch_control.guidance import blended
 from perch_control.maneuvers import tracked
@@ -79,9 +79,12 @@ class Schedule:
         order, leaving = self._pending
         source = order.source
         resting = x.mode in (State.ARMED, State.ATTACHED)
-        if resting and x.now - order.start > START_DELAY_MAX:
-            self._pending = None
-            return x._replace(message=f"trajectory {order.id} was not started: it starts {x.now - order.start:.2f} s in the past")
+        if resting and x.now >= order.start:
+            try:
+                check_start(order, x.now, x.expected(x.now))
+            except TrajectoryRefused as error:
+                self._pending = None
+                return x._replace(message=f"trajectory {order.id} was not started: it {error}")
         if not (resting or x.mode in (State.TRACKING, State.HOVERING)) or not (leaving or x.accepts(order)):
             self._pending = None
         elif x.now >= order.start:

@@ -106,7 +106,7 @@ class Supervisor:
         return x
 
     def _on_reference(self, x: FlightState) -> FlightState:
-        s, speed = self.settings, self.settings.land_speed
+        speed = self.settings.land_speed
         deviation = self._monitor.deviation(x.state_estimate, self.setpoint(x), x.now)
         outside = self._monitor.outside(x.state_estimate[0:3])
         if deviation:
@@ -119,8 +119,6 @@ class Supervisor:
             return landing(x, "landing: the rotors are at their limit", speed)
         if x.order is not None:
             return self._at_end(x, x.order, x.elapsed - x.order.source.duration)
-        if x.elapsed > s.silence_time:
-            return landing(x, f"landing: no order for {s.silence_time:.0f} s", speed)
         return x
 
     def _at_end(self, x: FlightState, order: Order, over: float) -> FlightState:

@@ -99,7 +99,7 @@ class GeometricController(Law):
     def check_contact(self, source: Source) -> None:
         """As `Law.check_contact`, by a simulation on the vehicle model (`contact_check.py`)."""
         distance, speed = contact_error(source, self)
-        if distance > CONTACT_MISS or speed > CONTACT_SPEED_MISS:
+        if not (distance <= CONTACT_MISS and speed <= CONTACT_SPEED_MISS):
             raise TrajectoryRefused(f"on its model the geometric law misses the contact by {100 * distance:.1f} cm and {speed:.2f} m/s: "
                                     "the rotors cannot follow this plan; the NMPC (controller.type: nmpc) may fly it")
 

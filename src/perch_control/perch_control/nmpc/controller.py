@@ -67,7 +67,6 @@ class NmpcController(Law):
         self._warm = False
         self._line_time = 0.0
         self._lines: tuple[tuple[float, ...], ...] = ()
-        self.failures = 0
         self._update_weights()
         self._warm_up()
 
