@@ -58,19 +58,19 @@ class World:
         self.mission.command.receivers.append(self.obey)
         self.mission.log.receivers.append(self.lines.append)
         self.mission.plan_perch = self.mission.plan_powerline = lambda request, due: (self.requests.append((request, due)), self.planner(request))
-        self.mission.plan_way_out = lambda request, due: self.mission.on_plan_way_out(PerchPlan(success=False, message="none"))
+        self.mission.plan_way_out = lambda request, due: self.mission.on_plan_way_out(request, PerchPlan(success=False, message="none"))
         self.goal = Sent(PerchGoal(**goal))
 
     def plan(self, request):
         path = rest_to_rest(request.p, SURFACE.p_WS, 0.0, 0.0, 1.2, start_time=seconds(request.start))
-        self.mission.on_plan_perch(PerchPlan(success=True, message="found", trajectory=path))
+        self.mission.on_plan_perch(request, PerchPlan(success=True, message="found", trajectory=path))
 
     def replan(self, request):
         """The rest of what is flown, in the time that is left."""
         start, duration = seconds(request.start), request.segment_times[0] if request.segment_times else 1.2
         p = request.p if request.current is None else request.current.sample(start - request.current.start_time).p
         path = rest_to_rest(p, SURFACE.p_WS, 0.0, 0.0, duration, start_time=start)
-        self.mission.on_plan_perch(PerchPlan(success=True, message="found", trajectory=path))
+        self.mission.on_plan_perch(request, PerchPlan(success=True, message="found", trajectory=path))
 
     def fly(self, order):
         self.orders.append(order)
@@ -197,7 +197,7 @@ def test_a_late_answer_is_flown_from_when_it_comes():
     (PerchPlan(success=True, message="forgot the trajectory"), "forgot")])
 def test_a_planner_that_is_missing_or_refuses_ends_the_goal(answer, said):
     world = World()
-    world.planner = lambda request: world.mission.on_plan_perch(answer)
+    world.planner = lambda request: world.mission.on_plan_perch(request, answer)
     world.send().run()
     assert (world.goal.ending, world.goal.result.error_code) == ("aborted", Result.REFUSED) and said in world.goal.result.message
 
@@ -205,7 +205,7 @@ def test_a_planner_that_is_missing_or_refuses_ends_the_goal(answer, said):
 @pytest.mark.parametrize("answer", [Unavailable("plan_way_out failed"), PerchPlan(success=False, message="none")])
 def test_ways_out_are_asked_for_although_the_planner_has_none_once(answer):
     world, asked = World(), []
-    world.mission.plan_way_out = lambda request, due: (asked.append(seconds(request.start)), world.mission.on_plan_way_out(answer))
+    world.mission.plan_way_out = lambda request, due: (asked.append(seconds(request.start)), world.mission.on_plan_way_out(request, answer))
     world.send().run()
     assert world.goal.ending == "succeeded" and len(asked) > 5 and asked == sorted(set(asked))
 
@@ -228,6 +228,21 @@ def test_an_answer_to_an_earlier_goal_is_not_taken_for_this_ones():
     world.plan(world.requests[1][0])
     world.run()
     assert world.goal.ending == "succeeded"
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_a_late_answer_after_a_timeout_is_not_taken_for_the_next_goals(success):
+    world = World(planner=lambda request: None).send().run()
+    assert world.goal.result.error_code == Result.TIMEOUT
+    world.goal, world.state = Sent(PerchGoal()), ControllerState.HOVERING
+    world.send().run(until=lambda w: len(w.requests) == 2)
+    orders, late = len(world.orders), world.requests[0][0]
+    if success:
+        world.plan(late)
+    else:
+        world.mission.on_plan_perch(late, PerchPlan(success=False, message="late"))
+    world.run(0.5)
+    assert world.phase == "planning" and len(world.orders) == orders
 
 
 def test_an_unasked_answer_is_nothing():
@@ -403,16 +418,17 @@ class Wires(World):
 
     def __init__(self, **goal):
         super().__init__(mode=1, perch_point=(4.0, 0.0, 4.2), perch_pitch=1.4, takeoff_height=4.2, **goal)
-        self.sees, self.line = False, LINE
+        self.sees, self.line, self.changes = False, LINE, {}
 
     def plan(self, request):
         t = np.linspace(0.0, 3.0, 60)
         zero = np.zeros((60, 3))
         q = np.tile([0.0, 0.0, 0.0, 1.0004], (60, 1))
         sampled = SampledTrajectory(t, np.tile(request.p, (60, 1)), q, zero, zero, zero, zero, np.ones((60, 4)), seconds(request.start))
-        self.mission.on_plan_powerline(PowerlinePlan(
+        plan = PowerlinePlan(
             success=True, message="", trajectory=sampled, at_end=0 if request.recovery_only else 3, recovery_start=0.0 if request.recovery_only else 2.0,
-            perch_time=0.0 if request.recovery_only else 2.0, recovery_time=1.0))
+            perch_time=0.0 if request.recovery_only else 2.0, recovery_time=1.0)
+        self.mission.on_plan_powerline(request, replace(plan, **self.changes))
 
     def tick(self):
         self.mission.on_powerlines(PowerlineMap(self.stamp - 40_000_000, (self.line,), False, ""))
@@ -428,6 +444,27 @@ def test_a_wire_is_asked_for_flown_and_left_by_ways_out():
     perch = next(o for o in world.orders if o.at_end == 3)
     assert perch.recovery_start == 2.0 and np.linalg.norm(perch.trajectory.q[0]) == pytest.approx(1.0004), "as planned: the controller normalises"
     assert any(o.at_end == 0 and isinstance(o.trajectory, SampledTrajectory) and o.id == perch.id for o in world.orders), "a way out, of the same number"
+
+
+PATH = rest_to_rest(np.zeros(3), SURFACE.p_WS, 0.0, 0.0, 3.0, start_time=20.0)
+
+
+@pytest.mark.parametrize("changes, word", [
+    ({"at_end": 7}, "at_end: 7 is outside"), ({"perch_time": NAN}, "perch after nan s"), ({"perch_time": 1e9}, "perch after 1e+09 s"),
+    ({"recovery_start": math.inf}, "recovery_start"), ({"trajectory": PATH}, "trajectory: polynomials")])
+def test_an_invalid_plan_is_refused_with_the_reason(changes, word):
+    world = Wires()
+    world.changes = changes
+    world.send().run(60.0)
+    assert world.goal.result.error_code == Result.REFUSED and f"planner refused: invalid plan: {word}" in world.goal.result.message
+
+
+def test_an_invalid_plan_for_a_surface_is_refused_with_the_reason():
+    world = World()
+    far = replace(PATH, coefficients=PATH.coefficients + 1e5)
+    world.planner = lambda request: world.mission.on_plan_perch(request, PerchPlan(success=True, trajectory=far))
+    world.send().run()
+    assert world.goal.result.error_code == Result.REFUSED and "invalid plan: trajectory: " in world.goal.result.message
 
 
 @pytest.mark.parametrize("line", [
