@@ -39,6 +39,7 @@ class PerchingMission(MissionMachine, Generic[R]):
     _first_id: int            # of an attempt's first trajectory; ids grow
     _first_start: float       # when that starts [s]
     _attached_sent_at: float  # time of the last command ATTACHED [s]
+    _stopped_at: np.ndarray | None = None  # where the motors stopped [m], shape (3,)
     _detached = False         # the vehicle came off after the motors had stopped
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
@@ -136,18 +137,22 @@ class PerchingMission(MissionMachine, Generic[R]):
             self._fail_attempt(inputs, "no adhesion")
 
     def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._adhesion.detached(inputs.state):
+        if self._stopped_at is None:
+            self._stopped_at = inputs.state.p_WB
+        rested, attached = self._elapsed(inputs) > self.settings.rest_time, inputs.controller is ControllerState.ATTACHED
+        if self._adhesion.detached(inputs.state) or rested and attached and not self._adhesion.rests(inputs.state, self._stopped_at):
             self._detached = True
             self._start_motors(outputs)
             self._fail_attempt(inputs, "came off the surface after the motors stopped")
-        elif self._elapsed(inputs) > self.settings.rest_time and inputs.controller is not ControllerState.ATTACHED:
+        elif rested and not attached:
             self._end(outputs, Result.TRACKING_LOST, f"the controller is not attached: {inputs.controller_message}")
-        elif self._elapsed(inputs) > self.settings.rest_time:
+        elif rested:
             result, message = Result.PERCHED, "perched"
             if self._cancelled:
                 result, message = Result.CANCELLED, f"cancelled too late: perched{self._too_late and f' ({self._too_late})'}"
             self._end(outputs, result, message, contact_time=self._contact_time)
-        elif inputs.controller in _IN_FLIGHT and inputs.time - self._attached_sent_at > ATTACHED_RETRY:
+        elif (inputs.controller in _IN_FLIGHT and inputs.time - self._attached_sent_at > ATTACHED_RETRY
+              and self._adhesion.attached(inputs.state, self._running.target)):
             self._attached_sent_at = inputs.time
             outputs.commands.append((Command.ATTACHED, "repeated"))  # the first command was lost
 
@@ -164,7 +169,7 @@ class PerchingMission(MissionMachine, Generic[R]):
         super()._enter(phase, time, message)
         self._detached = self._detached and phase is Phase.RECOVERING
         if phase is Phase.PERCHED:  # however the goal ends, this is what carries the vehicle
-            self._attached_sent_at = time
+            self._attached_sent_at, self._stopped_at = time, None
             self._moves.wire = self._running.target if self._running.target.lines else None
 
     # -- plans in flight ---------------------------------------------------------------------------------------------
