@@ -11,7 +11,7 @@ from perch_core.trajectory import rest_to_rest
 from perch_core.values import MappedPowerline
 from perch_core.vehicle import GRAVITY
 from perch_control.mission import (
-    AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Phase,
+    AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Outputs, Phase,
     Plan, Refusal, Result, State, SurfaceMission, Target)
 from perch_control.mission.departure import Departure
 from perch_control.mission.moves import Moves
@@ -247,6 +247,20 @@ def test_a_departure_without_a_plan_arms_until_the_controller_does():
     world.run(seconds=15.0)
     assert world.outcome.result is Result.PERCHED and world.controller is ControllerState.HOVERING
     assert world.commands == 3 * [Command.ARM] and world.queries == 1
+
+
+@pytest.mark.parametrize("answers, within, said", [(True, 1.2, "the controller has not accepted it: says so"), (False, 6.1, "the planner has not answered")])
+def test_a_departure_whose_plan_is_not_flown_arms(answers, within, said):
+    moves, time, out, query = Moves(MissionSettings()), 0.0, Outputs(), None
+    moves.wire = WIRE
+    machine = Departure(MissionSettings(), moves=moves)
+    machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), time)
+    while not out.commands and time < 15.0:
+        plan = Plan(rest_to_rest(np.zeros(3), np.ones(3), 0.0, 0.0, 1.0, time), 1.0) if answers and query is not None else None
+        out = machine.tick(Inputs(time, State(SURFACE.p_WS, Q_PERCH, np.zeros(3), np.zeros(3)), True, ControllerState.ATTACHED, "says so", 0, None,
+                                  np.zeros((0, 3)), plan))
+        query, time = out.query, time + TICK
+    assert [command for command, _ in out.commands] == [Command.ARM] and time < within and machine.message.endswith(said)
 
 
 def test_a_target_that_was_lost_has_to_be_in_view_for_as_long_again():
