@@ -269,6 +269,18 @@ def test_a_goal_that_cannot_be_flown_ends_with_the_reason(goal, word):
     assert world.goal.ending == "succeeded", "the next one is flown"
 
 
+def test_a_goal_after_a_cancel_on_the_ground_arms_again_although_the_last_state_is_older_than_the_cancel():
+    world = World().send().run(until=lambda w: w.state is ControllerState.ARMED)
+    world.goal.cancel_requested = True
+    world.run()
+    assert world.goal.ending == "cancelled" and world.state is ControllerState.DISARMED
+    world.goal, world.state = Sent(PerchGoal()), ControllerState.ARMED
+    world.send().tick()
+    assert not world.orders and world.commands[-1] is Command.ARM
+    world.run()
+    assert world.goal.ending == "succeeded"
+
+
 def test_one_goal_at_a_time():
     world = World().send().run(2.0)
     other = Sent(PerchGoal())
@@ -477,6 +489,13 @@ def test_a_map_with_a_line_that_is_none_is_refused(line):
     assert "powerlines" in world.said and "refused" in world.said
     world.mission.on_powerlines(PowerlineMap(10**15, (LINE,), False, ""))
     assert "future" in world.said
+
+
+def test_a_map_with_two_lines_of_one_id_is_refused():
+    world = Wires()
+    world.tick()
+    world.mission.on_powerlines(PowerlineMap(world.stamp, (LINE, LINE._replace(start=(5.0, -2.0, 4.25), end=(5.0, 2.0, 4.25))), False, ""))
+    assert "powerlines refused: two lines have the id 4" in world.said
 
 
 def test_settings_change_in_flight():

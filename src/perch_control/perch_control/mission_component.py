@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -227,7 +228,8 @@ class Mission(Component[MissionParameters]):
             trajectory_id=status.trajectory_id if status else 0,
             target=running.machine.target(self._targets.pad(x), self._targets.lines, state.p_WB),
             specific_force_B=np.array(self._forces).reshape(-1, 3),
-            cancel=running.goal.cancel_requested, imu_period=self._imu_period.value)
+            cancel=running.goal.cancel_requested, imu_period=self._imu_period.value,
+            controller_time=seconds(status.stamp) if status else -math.inf)
 
     def _newest(self, running: RunningGoal) -> dict[str, int | None]:
         return awaited(running, self._newest_imu, self._odometry, self._estimator, self._status, self._targets)
