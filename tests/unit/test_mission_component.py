@@ -172,6 +172,26 @@ def test_new_plans_are_flown_however_long_a_plan_takes(latency):
     assert np.diff(dues).min() >= latency * NANOSECONDS - 1, "one at a time"
 
 
+def test_a_new_plan_that_the_controller_refuses_is_not_taken_as_flown():
+    class Refusing(World):
+        def fly(self, order):
+            if order.at_end == 0 or all(other.at_end == 0 for other in self.orders):
+                super().fly(order)
+            else:
+                self.orders.append(order)
+
+    world, ways_out = Refusing(replan=True), []
+    world.planner = world.replan
+    world.mission.plan_way_out = lambda request, due: world.mission.on_plan_way_out(
+        request, PerchPlan(success=True, trajectory=rest_to_rest(np.zeros(3), np.ones(3), 0.0, 0.0, 1.0, start_time=seconds(request.start))))
+    world.mission.recovery.receivers[:] = [ways_out.append]
+    world.send().run()
+    perches = [order for order in world.orders if order.at_end]
+    assert len(perches) > 2 and ways_out[-1].id == world.id == perches[0].id
+    assert any("the new plan was not accepted: says so" in told.message for told in world.goal.told)
+    assert world.goal.ending == "succeeded"
+
+
 @pytest.mark.parametrize("ratio", [0.83, 0.0])
 def test_a_plan_is_asked_for_with_the_thrust_that_the_controller_has_found(ratio):
     world = World()

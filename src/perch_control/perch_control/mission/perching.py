@@ -14,6 +14,7 @@ from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
 
 ACCEPTANCE_TIMEOUT = 0.5  # a controller that still hovers so long after a plan's start has not accepted it [s]
+REPLACED_TIMEOUT = 0.1    # a plan that is still flown so long after its successor's start has not been replaced [s]
 ATTACHED_RETRY = 0.1      # period of the command ATTACHED while the controller still flies although the vehicle is attached [s]
 _IN_FLIGHT = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerState.RECOVERING)
 
@@ -36,6 +37,7 @@ class PerchingMission(MissionMachine, Generic[R]):
 
     _target: Target           # from the query on
     _running: R               # from the first trajectory on
+    _others: dict[int, R]     # plans of this attempt that were sent to the controller, other than the running one, by id
     _first_id: int            # of an attempt's first trajectory; ids grow
     _first_start: float       # when that starts [s]
     _attached_sent_at: float  # time of the last command ATTACHED [s]
@@ -96,7 +98,7 @@ class PerchingMission(MissionMachine, Generic[R]):
             return
         plan = inputs.plan if inputs.plan.start_time > inputs.time else inputs.plan.starting(inputs.time + LEAD)  # the hover lasts
         self._fly(self.running(plan, self._target), outputs)
-        self._first_id, self._first_start = self._flown_id, plan.start_time
+        self._first_id, self._first_start, self._others = self._flown_id, plan.start_time, {}
         self._enter(Phase.TRACKING, inputs.time, f"perching, {plan.duration:.2f} s")
 
     def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -113,6 +115,7 @@ class PerchingMission(MissionMachine, Generic[R]):
             self._end(outputs, Result.REFUSED, f"the controller has not accepted the plan: {inputs.controller_message}")
             return
         if not hovers:  # a controller that hovers has not begun, or was commanded to stay
+            self._return_to_flown_plan(inputs)
             self.update_plan(inputs, outputs)
         if inputs.time > end - self.settings.contact_early:
             self._adhesion.reset()
@@ -179,5 +182,16 @@ class PerchingMission(MissionMachine, Generic[R]):
         outputs.perch, outputs.trajectory_id = running.plan, self._flown_id
 
     def _fly_new_plan(self, running: R, outputs: Outputs) -> None:
+        self._others[self._flown_id] = self._running
         self._fly(running, outputs)
         self.message = f"re-planned, {running.plan.duration:.2f} s"
+
+    def _return_to_flown_plan(self, inputs: Inputs) -> None:
+        """Return to the plan that the controller flies, where it has not accepted the one after it."""
+        if inputs.trajectory_id == self._flown_id or inputs.trajectory_id not in self._others:
+            return
+        successor = self._others.get(inputs.trajectory_id + 1, self._running)
+        if inputs.time > successor.plan.start_time + REPLACED_TIMEOUT:
+            self._others[self._flown_id] = self._running
+            self._flown_id, self._running = inputs.trajectory_id, self._others[inputs.trajectory_id]
+            self.message = f"the new plan was not accepted: {inputs.controller_message}"
