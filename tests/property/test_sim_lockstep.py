@@ -352,7 +352,7 @@ class Asking(Component[Nothing]):
     def on_number(self, number):
         self.plan(number, number)
 
-    def on_plan(self, answer):
+    def on_plan(self, request, answer):
         self.said(f"answer {answer.reason if isinstance(answer, Unavailable) else answer}")
 
     def on_perch(self, goal):

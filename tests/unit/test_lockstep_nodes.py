@@ -34,7 +34,7 @@ class Asking(Component[Nothing]):
         super().__init__(config)
         self.answers: list[str] = []
 
-    def on_plan_perch(self, answer) -> None:
+    def on_plan_perch(self, request, answer) -> None:
         """Keep it."""
         self.answers.append(answer.reason if isinstance(answer, Unavailable) else answer.message)
 
@@ -185,9 +185,9 @@ class Shaky(Asking):
 
     tick = Timer(0.1)
 
-    def on_plan_perch(self, answer) -> None:
+    def on_plan_perch(self, request, answer) -> None:
         """Keep it; a defect."""
-        super().on_plan_perch(answer)
+        super().on_plan_perch(request, answer)
         if len(self.answers) == 1:
             raise ZeroDivisionError("no answer is foreseen")
 

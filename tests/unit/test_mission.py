@@ -11,7 +11,7 @@ from perch_core.trajectory import rest_to_rest
 from perch_core.values import MappedPowerline
 from perch_core.vehicle import GRAVITY
 from perch_control.mission import (
-    AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Phase,
+    AdhesionMonitor, Command, ControllerState, Goal, Inputs, MissionSettings, Outputs, Phase,
     Plan, Refusal, Result, State, SurfaceMission, Target)
 from perch_control.mission.departure import Departure
 from perch_control.mission.moves import Moves
@@ -249,6 +249,20 @@ def test_a_departure_without_a_plan_arms_until_the_controller_does():
     assert world.commands == 3 * [Command.ARM] and world.queries == 1
 
 
+@pytest.mark.parametrize("answers, within, said", [(True, 1.2, "the controller has not accepted it: says so"), (False, 6.1, "the planner has not answered")])
+def test_a_departure_whose_plan_is_not_flown_arms(answers, within, said):
+    moves, time, out, query = Moves(MissionSettings()), 0.0, Outputs(), None
+    moves.wire = WIRE
+    machine = Departure(MissionSettings(), moves=moves)
+    machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), time)
+    while not out.commands and time < 15.0:
+        plan = Plan(rest_to_rest(np.zeros(3), np.ones(3), 0.0, 0.0, 1.0, time), 1.0) if answers and query is not None else None
+        out = machine.tick(Inputs(time, State(SURFACE.p_WS, Q_PERCH, np.zeros(3), np.zeros(3)), True, ControllerState.ATTACHED, "says so", 0, None,
+                                  np.zeros((0, 3)), plan))
+        query, time = out.query, time + TICK
+    assert [command for command, _ in out.commands] == [Command.ARM] and time < within and machine.message.endswith(said)
+
+
 def test_a_target_that_was_lost_has_to_be_in_view_for_as_long_again():
     world = reached(Phase.SEARCHING)
     while world.machine.message != "target in view":
@@ -452,3 +466,51 @@ def test_goals_in_the_air_go_by_where_the_vehicle_took_off_and_not_by_where_it_i
         moves.begin(goal, State(np.array(p), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3)), on_ground=seen and p[2] == 0.0)
         assert moves.hover[0] == pytest.approx(p) and moves.home[0] == pytest.approx(home)
         assert moves.search[0] == pytest.approx(np.add(home, [0.0, 0.0, 1.2]))
+
+
+def test_a_vehicle_at_rest_has_neither_moved_far_nor_fast():
+    """A pad may move: 0.3 m/s for the 0.6 s of rest."""
+    def at(z, v):
+        return State(SURFACE.p_WS + [0.0, 0.0, z], Q_PERCH, np.array([0.0, 0.0, v]), np.zeros(3))
+
+    assert AdhesionMonitor.rests(at(-0.18, -0.3), SURFACE.p_WS)
+    assert not AdhesionMonitor.rests(at(-0.27, -0.1), SURFACE.p_WS) and not AdhesionMonitor.rests(at(-0.1, -0.6), SURFACE.p_WS)
+
+
+def slid(speed: float, acceleration: float) -> tuple[list[Command], float]:
+    """A perch that slides down, with the motors off: the commands since then, and how far it slid when they were given [m]."""
+    world = reached(Phase.PERCHED)
+    began, commands, z = world.time, [], 0.0
+    force = so3.quat_rotate(so3.quat_conjugate(Q_PERCH), [0.0, 0.0, GRAVITY - acceleration])
+    while not commands and world.machine.phase is Phase.PERCHED:
+        t = world.time - began
+        z, v = speed * t + 0.5 * acceleration * t**2, speed + acceleration * t
+        out = world.machine.tick(Inputs(
+            world.time, State(SURFACE.p_WS - [0.0, 0.0, z], Q_PERCH, np.array([0.0, 0.0, -v]), np.zeros(3)), True, ControllerState.ATTACHED, "",
+            world.trajectory_id, None, np.tile(force, (10, 1))))
+        commands, world.time = [command for command, _ in out.commands], world.time + TICK
+    assert out.outcome is None or out.outcome.result is Result.PERCHED
+    return commands, z
+
+
+@pytest.mark.parametrize("speed, acceleration, limit", [(0.45, 0.0, 0.3), (0.0, 1.0, 0.25), (0.0, 5.0, 0.15), (0.0, 5.8, 0.15)])
+def test_a_vehicle_that_slides_has_come_off(speed, acceleration, limit):
+    commands, z = slid(speed, acceleration)
+    assert commands == [Command.ARM, Command.HOVER] and z < limit
+
+
+def test_a_vehicle_on_a_pad_that_moves_stays():
+    assert slid(0.3, 0.0)[0] == []
+
+
+def test_attached_is_not_repeated_once_the_vehicle_has_left():
+    """The first command was lost, and the controller recovers from a miss."""
+    world = reached(Phase.VERIFYING)
+    world.lost_attached = 1
+    while world.machine.phase is not Phase.PERCHED:
+        world.tick()
+    world.recover()
+    world.q, world.p, world.reference = np.array([0.0, 0.0, 0.0, 1.0]), SURFACE.p_WS - [0.3, 0.0, 0.2], None
+    while world.outcome is None:
+        world.tick()
+    assert world.commands == [Command.ARM, Command.ATTACHED] and "not attached" in world.outcome.message

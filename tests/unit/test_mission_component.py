@@ -58,19 +58,19 @@ class World:
         self.mission.command.receivers.append(self.obey)
         self.mission.log.receivers.append(self.lines.append)
         self.mission.plan_perch = self.mission.plan_powerline = lambda request, due: (self.requests.append((request, due)), self.planner(request))
-        self.mission.plan_way_out = lambda request, due: self.mission.on_plan_way_out(PerchPlan(success=False, message="none"))
+        self.mission.plan_way_out = lambda request, due: self.mission.on_plan_way_out(request, PerchPlan(success=False, message="none"))
         self.goal = Sent(PerchGoal(**goal))
 
     def plan(self, request):
         path = rest_to_rest(request.p, SURFACE.p_WS, 0.0, 0.0, 1.2, start_time=seconds(request.start))
-        self.mission.on_plan_perch(PerchPlan(success=True, message="found", trajectory=path))
+        self.mission.on_plan_perch(request, PerchPlan(success=True, message="found", trajectory=path))
 
     def replan(self, request):
         """The rest of what is flown, in the time that is left."""
         start, duration = seconds(request.start), request.segment_times[0] if request.segment_times else 1.2
         p = request.p if request.current is None else request.current.sample(start - request.current.start_time).p
         path = rest_to_rest(p, SURFACE.p_WS, 0.0, 0.0, duration, start_time=start)
-        self.mission.on_plan_perch(PerchPlan(success=True, message="found", trajectory=path))
+        self.mission.on_plan_perch(request, PerchPlan(success=True, message="found", trajectory=path))
 
     def fly(self, order):
         self.orders.append(order)
@@ -172,6 +172,26 @@ def test_new_plans_are_flown_however_long_a_plan_takes(latency):
     assert np.diff(dues).min() >= latency * NANOSECONDS - 1, "one at a time"
 
 
+def test_a_new_plan_that_the_controller_refuses_is_not_taken_as_flown():
+    class Refusing(World):
+        def fly(self, order):
+            if order.at_end == 0 or all(other.at_end == 0 for other in self.orders):
+                super().fly(order)
+            else:
+                self.orders.append(order)
+
+    world, ways_out = Refusing(replan=True), []
+    world.planner = world.replan
+    world.mission.plan_way_out = lambda request, due: world.mission.on_plan_way_out(
+        request, PerchPlan(success=True, trajectory=rest_to_rest(np.zeros(3), np.ones(3), 0.0, 0.0, 1.0, start_time=seconds(request.start))))
+    world.mission.recovery.receivers[:] = [ways_out.append]
+    world.send().run()
+    perches = [order for order in world.orders if order.at_end]
+    assert len(perches) > 2 and ways_out[-1].id == world.id == perches[0].id
+    assert any("the new plan was not accepted: says so" in told.message for told in world.goal.told)
+    assert world.goal.ending == "succeeded"
+
+
 @pytest.mark.parametrize("ratio", [0.83, 0.0])
 def test_a_plan_is_asked_for_with_the_thrust_that_the_controller_has_found(ratio):
     world = World()
@@ -197,7 +217,7 @@ def test_a_late_answer_is_flown_from_when_it_comes():
     (PerchPlan(success=True, message="forgot the trajectory"), "forgot")])
 def test_a_planner_that_is_missing_or_refuses_ends_the_goal(answer, said):
     world = World()
-    world.planner = lambda request: world.mission.on_plan_perch(answer)
+    world.planner = lambda request: world.mission.on_plan_perch(request, answer)
     world.send().run()
     assert (world.goal.ending, world.goal.result.error_code) == ("aborted", Result.REFUSED) and said in world.goal.result.message
 
@@ -205,7 +225,7 @@ def test_a_planner_that_is_missing_or_refuses_ends_the_goal(answer, said):
 @pytest.mark.parametrize("answer", [Unavailable("plan_way_out failed"), PerchPlan(success=False, message="none")])
 def test_ways_out_are_asked_for_although_the_planner_has_none_once(answer):
     world, asked = World(), []
-    world.mission.plan_way_out = lambda request, due: (asked.append(seconds(request.start)), world.mission.on_plan_way_out(answer))
+    world.mission.plan_way_out = lambda request, due: (asked.append(seconds(request.start)), world.mission.on_plan_way_out(request, answer))
     world.send().run()
     assert world.goal.ending == "succeeded" and len(asked) > 5 and asked == sorted(set(asked))
 
@@ -230,6 +250,21 @@ def test_an_answer_to_an_earlier_goal_is_not_taken_for_this_ones():
     assert world.goal.ending == "succeeded"
 
 
+@pytest.mark.parametrize("success", [True, False])
+def test_a_late_answer_after_a_timeout_is_not_taken_for_the_next_goals(success):
+    world = World(planner=lambda request: None).send().run()
+    assert world.goal.result.error_code == Result.TIMEOUT
+    world.goal, world.state = Sent(PerchGoal()), ControllerState.HOVERING
+    world.send().run(until=lambda w: len(w.requests) == 2)
+    orders, late = len(world.orders), world.requests[0][0]
+    if success:
+        world.plan(late)
+    else:
+        world.mission.on_plan_perch(late, PerchPlan(success=False, message="late"))
+    world.run(0.5)
+    assert world.phase == "planning" and len(world.orders) == orders
+
+
 def test_an_unasked_answer_is_nothing():
     world = World()
     world.plan(type("Request", (), {"p": np.zeros(3), "start": 0}))
@@ -252,6 +287,18 @@ def test_a_goal_that_cannot_be_flown_ends_with_the_reason(goal, word):
     world.goal = Sent(PerchGoal())
     world.send().run()
     assert world.goal.ending == "succeeded", "the next one is flown"
+
+
+def test_a_goal_after_a_cancel_on_the_ground_arms_again_although_the_last_state_is_older_than_the_cancel():
+    world = World().send().run(until=lambda w: w.state is ControllerState.ARMED)
+    world.goal.cancel_requested = True
+    world.run()
+    assert world.goal.ending == "cancelled" and world.state is ControllerState.DISARMED
+    world.goal, world.state = Sent(PerchGoal()), ControllerState.ARMED
+    world.send().tick()
+    assert not world.orders and world.commands[-1] is Command.ARM
+    world.run()
+    assert world.goal.ending == "succeeded"
 
 
 def test_one_goal_at_a_time():
@@ -403,16 +450,17 @@ class Wires(World):
 
     def __init__(self, **goal):
         super().__init__(mode=1, perch_point=(4.0, 0.0, 4.2), perch_pitch=1.4, takeoff_height=4.2, **goal)
-        self.sees, self.line = False, LINE
+        self.sees, self.line, self.changes = False, LINE, {}
 
     def plan(self, request):
         t = np.linspace(0.0, 3.0, 60)
         zero = np.zeros((60, 3))
         q = np.tile([0.0, 0.0, 0.0, 1.0004], (60, 1))
         sampled = SampledTrajectory(t, np.tile(request.p, (60, 1)), q, zero, zero, zero, zero, np.ones((60, 4)), seconds(request.start))
-        self.mission.on_plan_powerline(PowerlinePlan(
+        plan = PowerlinePlan(
             success=True, message="", trajectory=sampled, at_end=0 if request.recovery_only else 3, recovery_start=0.0 if request.recovery_only else 2.0,
-            perch_time=0.0 if request.recovery_only else 2.0, recovery_time=1.0))
+            perch_time=0.0 if request.recovery_only else 2.0, recovery_time=1.0)
+        self.mission.on_plan_powerline(request, replace(plan, **self.changes))
 
     def tick(self):
         self.mission.on_powerlines(PowerlineMap(self.stamp - 40_000_000, (self.line,), False, ""))
@@ -430,6 +478,27 @@ def test_a_wire_is_asked_for_flown_and_left_by_ways_out():
     assert any(o.at_end == 0 and isinstance(o.trajectory, SampledTrajectory) and o.id == perch.id for o in world.orders), "a way out, of the same number"
 
 
+PATH = rest_to_rest(np.zeros(3), SURFACE.p_WS, 0.0, 0.0, 3.0, start_time=20.0)
+
+
+@pytest.mark.parametrize("changes, word", [
+    ({"at_end": 7}, "at_end: 7 is outside"), ({"perch_time": NAN}, "perch after nan s"), ({"perch_time": 1e9}, "perch after 1e+09 s"),
+    ({"recovery_start": math.inf}, "recovery_start"), ({"trajectory": PATH}, "trajectory: polynomials")])
+def test_an_invalid_plan_is_refused_with_the_reason(changes, word):
+    world = Wires()
+    world.changes = changes
+    world.send().run(60.0)
+    assert world.goal.result.error_code == Result.REFUSED and f"planner refused: invalid plan: {word}" in world.goal.result.message
+
+
+def test_an_invalid_plan_for_a_surface_is_refused_with_the_reason():
+    world = World()
+    far = replace(PATH, coefficients=PATH.coefficients + 1e5)
+    world.planner = lambda request: world.mission.on_plan_perch(request, PerchPlan(success=True, trajectory=far))
+    world.send().run()
+    assert world.goal.result.error_code == Result.REFUSED and "invalid plan: trajectory: " in world.goal.result.message
+
+
 @pytest.mark.parametrize("line", [
     LINE._replace(start=(NAN, 0.0, 0.0)), LINE._replace(end=LINE.start), LINE._replace(radius=-1.0), LINE._replace(covariance=np.full((3, 3), NAN)),
     LINE._replace(covariance=np.eye(6)), LINE._replace(direction_sigma=NAN)])
@@ -440,6 +509,13 @@ def test_a_map_with_a_line_that_is_none_is_refused(line):
     assert "powerlines" in world.said and "refused" in world.said
     world.mission.on_powerlines(PowerlineMap(10**15, (LINE,), False, ""))
     assert "future" in world.said
+
+
+def test_a_map_with_two_lines_of_one_id_is_refused():
+    world = Wires()
+    world.tick()
+    world.mission.on_powerlines(PowerlineMap(world.stamp, (LINE, LINE._replace(start=(5.0, -2.0, 4.25), end=(5.0, 2.0, 4.25))), False, ""))
+    assert "powerlines refused: two lines have the id 4" in world.said
 
 
 def test_settings_change_in_flight():

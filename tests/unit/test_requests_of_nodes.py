@@ -30,7 +30,7 @@ class Asking(Component[Nothing]):
     config_type = Nothing
     plan_perch = Client(PerchPlanRequest, PerchPlan, "plan_perch")
 
-    def on_plan_perch(self, answer: PerchPlan | Unavailable) -> None:
+    def on_plan_perch(self, request: PerchPlanRequest, answer: PerchPlan | Unavailable) -> None:
         """Keep it."""
         self.answers = [*getattr(self, "answers", []), answer]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +10,7 @@ from itertools import count
 
 import numpy as np
 
-from perch_core.component import Action, Client, Component, Diagnostics, Goal, Input, Output, Service, Unavailable, Timer
+from perch_core.component import Action, Client, Component, Diagnostics, Goal, Input, Output, Service, Timer
 from perch_core.imu_axes import ImuAxes
 from perch_core.values import (
     NANOSECONDS, STALE, AtEnd, ControllerCommand, ControllerStatus, EstimatorHealth, ImuSample, OdometryState, PerchFeedback, PerchGoal,
@@ -22,7 +23,7 @@ from perch_control.mission.machine import MissionMachine
 from perch_control.mission.missions import mission_class
 from perch_control.mission.moves import Moves
 from perch_control.mission.parameters import MissionParameters
-from perch_control.mission.pending_requests import PendingRequest, Requests
+from perch_control.mission.pending_requests import Answer, PendingRequest, Request
 from perch_control.mission.requests import flown_order, perch_request, plan_answer, powerline_request
 from perch_control.mission.running_goal import DepartureGoal, RunningGoal
 from perch_control.mission.targets import Targets
@@ -73,7 +74,7 @@ class Mission(Component[MissionParameters]):
         self._begin()
 
     def _begin(self) -> None:
-        """Reset all inputs, moves and requests."""
+        """Reset all inputs and moves."""
         self._stamps, self._imu_period = StampGuard(), MeasuredPeriod()
         self._moves = Moves(self.config.mission)  # `home` is kept from goal to goal
         self._forces: deque[tuple[float, ...]] = deque(maxlen=IMU_SAMPLES_MAX)
@@ -82,7 +83,6 @@ class Mission(Component[MissionParameters]):
         self._targets = Targets()
         self._status: ControllerStatus | None = None
         self._estimator: EstimatorHealth | None = None
-        self._requests = {channel: Requests() for channel in ("plan_perch", "plan_way_out", "plan_powerline")}
         self._last_odometry_stamp = self._last_odometry_time = -1  # odometry of the last tick, and the host's time then [ns]
         self._idle_ticks = 0  # since the newest odometry or the goal; they are regular although simulated time may stand still
         self._last_feedback = (-FEEDBACK_PERIOD, "", "")  # the last feedback: stamp [ns], phase, message
@@ -211,9 +211,11 @@ class Mission(Component[MissionParameters]):
         running.overdue = overdue(stamp, nanoseconds(running.machine.since), self._newest(running))
         inputs = self._inputs(running, time, odometry)
         if plan is not None and stamp >= plan.due and plan.answer is not None:
-            running.pending, inputs = None, replace(inputs, plan=plan_answer(plan.answer))
+            running.pending = None
+            inputs = replace(inputs, plan=plan_answer(plan.answer))
         if way_out is not None and stamp >= way_out.due and way_out.answer is not None:
-            running.way_out, inputs = None, replace(inputs, way_out=plan_answer(way_out.answer))
+            running.way_out = None
+            inputs = replace(inputs, way_out=plan_answer(way_out.answer))
         self._act(running, stamp, running.machine.tick(inputs))
 
     def _inputs(self, running: RunningGoal, time: float, x: OdometryState) -> Inputs:
@@ -226,7 +228,8 @@ class Mission(Component[MissionParameters]):
             trajectory_id=status.trajectory_id if status else 0,
             target=running.machine.target(self._targets.pad(x), self._targets.lines, state.p_WB),
             specific_force_B=np.array(self._forces).reshape(-1, 3),
-            cancel=running.goal.cancel_requested, imu_period=self._imu_period.value)
+            cancel=running.goal.cancel_requested, imu_period=self._imu_period.value,
+            controller_time=seconds(status.stamp) if status else -math.inf)
 
     def _newest(self, running: RunningGoal) -> dict[str, int | None]:
         return awaited(running, self._newest_imu, self._odometry, self._estimator, self._status, self._targets)
@@ -241,9 +244,9 @@ class Mission(Component[MissionParameters]):
         if outputs.way_out is not None:
             self.recovery(TrajectoryOrder.of(outputs.trajectory_id, outputs.way_out.trajectory, AtEnd.HOLD))
         if outputs.query is not None:
-            running.pending = self._request_plan(running, stamp, outputs.query)
+            self._request_plan(running, stamp, outputs.query)
         if outputs.way_out_query is not None:
-            running.way_out = self._request_plan(running, stamp, outputs.way_out_query)
+            self._request_plan(running, stamp, outputs.way_out_query)
         if running.machine.phase.value != "idle":
             self._publish_feedback(running, stamp)
         if outputs.outcome is not None:
@@ -260,26 +263,24 @@ class Mission(Component[MissionParameters]):
 
     # -- planners ----------------------------------------------------------------------------------------------------
 
-    def _request_plan(self, running: RunningGoal, stamp: int, query: PlanQuery) -> PendingRequest:
+    def _request_plan(self, running: RunningGoal, stamp: int, query: PlanQuery) -> None:
         surface = not query.target.lines
         channel = "plan_powerline" if not surface else "plan_way_out" if query.recovery else "plan_perch"
-        start = seconds(nanoseconds(query.start_time))
-        request = self._requests[channel].add(PendingRequest(channel, stamp, stamp + nanoseconds(query.latency), start))
-        ratio = self._status.thrust_ratio if self._status is not None else 0.0
-        getattr(self, channel)(perch_request(query, ratio) if surface else powerline_request(query), request.due)
-        return request
+        request = perch_request(query, self._status.thrust_ratio if self._status else 0.0) if surface else powerline_request(query)
+        pending = PendingRequest(channel, stamp, stamp + nanoseconds(query.latency), request)
+        if channel == "plan_way_out":
+            running.way_out = pending
+        else:
+            running.pending = pending
+        getattr(self, channel)(request, pending.due)
 
-    def on_plan_perch(self, plan: PerchPlan | Unavailable) -> None:
-        """Keep the answer until it is due."""
-        self._requests["plan_perch"].answered(plan)
+    def _keep_answer(self, request: Request, answer: Answer) -> None:
+        """Keep an answer until it is due; one to a request that is no longer pending is dropped."""
+        for pending in () if self._running is None else (self._running.pending, self._running.way_out):
+            if pending is not None and pending.request is request:
+                pending.answer = answer
 
-    def on_plan_way_out(self, plan: PerchPlan | Unavailable) -> None:
-        """Keep the answer until it is due."""
-        self._requests["plan_way_out"].answered(plan)
-
-    def on_plan_powerline(self, plan: PowerlinePlan | Unavailable) -> None:
-        """Keep the answer until it is due."""
-        self._requests["plan_powerline"].answered(plan)
+    on_plan_perch = on_plan_way_out = on_plan_powerline = _keep_answer
 
     # -- goals -------------------------------------------------------------------------------------------------------
 

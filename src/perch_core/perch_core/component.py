@@ -135,7 +135,7 @@ class Service(_Port, Generic[Q, A]):
 
 
 class Client(_Port, Generic[Q, A]):
-    """Client port: `self.<name>(request, due)` sends a request; the answer is passed to `on_<name>(answer)`.
+    """Client port: `self.<name>(request, due)` sends a request; the answer is passed to `on_<name>(request, answer)`.
 
     In simulation, where work takes no simulated time, the answer is delivered at the stamp `due` [ns]; elsewhere, as soon as it
     is available. Where the server is missing or fails, the answer is `Unavailable`.

@@ -15,7 +15,8 @@ WINDOW = 0.06  # time over which the specific force is averaged [s]
 IMBALANCE_MAX = 3.0  # largest difference between the mean specific force and gravity of a body at rest [m/s^2]
 SPEED = 0.5  # of a vehicle at rest, as estimated [m/s]
 TILT = np.radians(25.0)  # between b3 and the surface normal
-DISTANCE = 0.25  # from the localised pad's centre [m]
+DISTANCE = 0.25  # from the localised pad's centre, or from the place where the motors stopped [m]
+_SLIDE_SPEED = 1.0  # of a vehicle that slides or falls; in its attachment it swings more slowly, and pads move more slowly [m/s]
 _IMBALANCE_MIN = 0.8  # least threshold of the imbalance: vibration and attitude errors cause less at rest [m/s^2]
 _TILT_MIN = np.radians(8.0)  # least tolerance of the tilt: the grip's play and attitude errors cause less
 _UP = np.array([0.0, 0.0, 1.0])
@@ -58,12 +59,19 @@ class AdhesionMonitor:
         return float(np.linalg.norm(np.mean(self._samples, axis=0) - g_B))
 
     def detached(self, state: State) -> bool:
-        """Whether the vehicle has come off, with its motors off: the specific force is small, and the vehicle moves.
+        """Whether the vehicle has come off, with its motors off: it is fast, or it moves and the specific force is small.
 
         While the vehicle swings in its attachment, the specific force may also be small for a moment; but the speed stays low.
         """
-        return (self.filled and float(np.linalg.norm(np.mean(self._samples, axis=0))) < 0.4 * GRAVITY
-                and float(np.linalg.norm(state.v_WB)) > SPEED)
+        if not self.filled:
+            return False
+        falls = np.linalg.norm(np.mean(self._samples, axis=0)) < 0.4 * GRAVITY
+        return bool(np.linalg.norm(state.v_WB) > (SPEED if falls else _SLIDE_SPEED))
+
+    @staticmethod
+    def rests(state: State, p_W: np.ndarray) -> bool:
+        """Whether the vehicle is slow and still near the place where its motors stopped, `p_W` [m], shape (3,)."""
+        return bool(np.linalg.norm(state.v_WB) < SPEED and np.linalg.norm(state.p_WB - p_W) < DISTANCE)
 
     def attached(self, state: State, target: Target) -> bool:
         """Whether the vehicle rests on the target: in place, aligned, slow, and carried by something other than its rotors."""

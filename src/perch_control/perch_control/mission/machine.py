@@ -143,7 +143,7 @@ class MissionMachine(ABC):
             self._end(outputs, Result.PERCHED_ALREADY, "the vehicle is perched; call the service `depart` first")
         elif inputs.controller in _FLYING and inputs.estimator_ready:
             self._go_to_search(inputs, outputs, "already flying: going to the search place")
-        elif inputs.controller is ControllerState.ARMED and inputs.estimator_ready:
+        elif inputs.controller is ControllerState.ARMED and inputs.controller_time > self.since and inputs.estimator_ready:
             self._go_to_search(inputs, outputs, "taking off", on_ground=True)
         elif self._elapsed(inputs) > self.settings.arming_timeout:
             outputs.commands.append((Command.DISARM, "arming took too long"))

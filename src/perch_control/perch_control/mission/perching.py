@@ -14,6 +14,7 @@ from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
 
 ACCEPTANCE_TIMEOUT = 0.5  # a controller that still hovers so long after a plan's start has not accepted it [s]
+REPLACED_TIMEOUT = 0.1    # a plan that is still flown so long after its successor's start has not been replaced [s]
 ATTACHED_RETRY = 0.1      # period of the command ATTACHED while the controller still flies although the vehicle is attached [s]
 _IN_FLIGHT = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerState.RECOVERING)
 
@@ -36,9 +37,12 @@ class PerchingMission(MissionMachine, Generic[R]):
 
     _target: Target           # from the query on
     _running: R               # from the first trajectory on
+    _others: dict[int, R]     # plans of this attempt that were sent to the controller, other than the running one, by id
+    _given_up = 0             # id of the last plan that was not accepted
     _first_id: int            # of an attempt's first trajectory; ids grow
     _first_start: float       # when that starts [s]
     _attached_sent_at: float  # time of the last command ATTACHED [s]
+    _stopped_at: np.ndarray | None = None  # where the motors stopped [m], shape (3,)
     _detached = False         # the vehicle came off after the motors had stopped
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
@@ -95,7 +99,7 @@ class PerchingMission(MissionMachine, Generic[R]):
             return
         plan = inputs.plan if inputs.plan.start_time > inputs.time else inputs.plan.starting(inputs.time + LEAD)  # the hover lasts
         self._fly(self.running(plan, self._target), outputs)
-        self._first_id, self._first_start = self._flown_id, plan.start_time
+        self._first_id, self._first_start, self._others = self._flown_id, plan.start_time, {}
         self._enter(Phase.TRACKING, inputs.time, f"perching, {plan.duration:.2f} s")
 
     def _tracking(self, inputs: Inputs, outputs: Outputs) -> None:
@@ -112,6 +116,7 @@ class PerchingMission(MissionMachine, Generic[R]):
             self._end(outputs, Result.REFUSED, f"the controller has not accepted the plan: {inputs.controller_message}")
             return
         if not hovers:  # a controller that hovers has not begun, or was commanded to stay
+            self._return_to_flown_plan(inputs)
             self.update_plan(inputs, outputs)
         if inputs.time > end - self.settings.contact_early:
             self._adhesion.reset()
@@ -136,18 +141,22 @@ class PerchingMission(MissionMachine, Generic[R]):
             self._fail_attempt(inputs, "no adhesion")
 
     def _perched(self, inputs: Inputs, outputs: Outputs) -> None:
-        if self._adhesion.detached(inputs.state):
+        if self._stopped_at is None:
+            self._stopped_at = inputs.state.p_WB
+        rested, attached = self._elapsed(inputs) > self.settings.rest_time, inputs.controller is ControllerState.ATTACHED
+        if self._adhesion.detached(inputs.state) or rested and attached and not self._adhesion.rests(inputs.state, self._stopped_at):
             self._detached = True
             self._start_motors(outputs)
             self._fail_attempt(inputs, "came off the surface after the motors stopped")
-        elif self._elapsed(inputs) > self.settings.rest_time and inputs.controller is not ControllerState.ATTACHED:
+        elif rested and not attached:
             self._end(outputs, Result.TRACKING_LOST, f"the controller is not attached: {inputs.controller_message}")
-        elif self._elapsed(inputs) > self.settings.rest_time:
+        elif rested:
             result, message = Result.PERCHED, "perched"
             if self._cancelled:
                 result, message = Result.CANCELLED, f"cancelled too late: perched{self._too_late and f' ({self._too_late})'}"
             self._end(outputs, result, message, contact_time=self._contact_time)
-        elif inputs.controller in _IN_FLIGHT and inputs.time - self._attached_sent_at > ATTACHED_RETRY:
+        elif (inputs.controller in _IN_FLIGHT and inputs.time - self._attached_sent_at > ATTACHED_RETRY
+              and self._adhesion.attached(inputs.state, self._running.target)):
             self._attached_sent_at = inputs.time
             outputs.commands.append((Command.ATTACHED, "repeated"))  # the first command was lost
 
@@ -164,7 +173,7 @@ class PerchingMission(MissionMachine, Generic[R]):
         super()._enter(phase, time, message)
         self._detached = self._detached and phase is Phase.RECOVERING
         if phase is Phase.PERCHED:  # however the goal ends, this is what carries the vehicle
-            self._attached_sent_at = time
+            self._attached_sent_at, self._stopped_at = time, None
             self._moves.wire = self._running.target if self._running.target.lines else None
 
     # -- plans in flight ---------------------------------------------------------------------------------------------
@@ -174,5 +183,17 @@ class PerchingMission(MissionMachine, Generic[R]):
         outputs.perch, outputs.trajectory_id = running.plan, self._flown_id
 
     def _fly_new_plan(self, running: R, outputs: Outputs) -> None:
+        self._others[self._flown_id] = self._running
         self._fly(running, outputs)
         self.message = f"re-planned, {running.plan.duration:.2f} s"
+
+    def _return_to_flown_plan(self, inputs: Inputs) -> None:
+        """Return to the plan that the controller flies, where it has not accepted the one after it."""
+        if inputs.trajectory_id == self._flown_id or inputs.trajectory_id not in self._others:
+            return
+        next_id = max(inputs.trajectory_id, self._given_up) + 1
+        successor = self._others.get(next_id, self._running)
+        if inputs.time > successor.plan.start_time + REPLACED_TIMEOUT:
+            self._others[self._flown_id], self._given_up = self._running, next_id
+            self._flown_id, self._running = inputs.trajectory_id, self._others[inputs.trajectory_id]
+            self.message = f"the new plan was not accepted: {inputs.controller_message}"

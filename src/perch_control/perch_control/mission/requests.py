@@ -8,8 +8,11 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.component import Unavailable
-from perch_core.values import AtEnd, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest, TrajectoryOrder, nanoseconds
+from perch_core.trajectory import FlatTrajectory
+from perch_core.values import AtEnd, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest, TrajectoryOrder, limits, nanoseconds
 from perch_control.mission.values import Plan, PlanQuery, Refusal
+
+_ROUNDING = 1e-6  # of the times in an answer [s]
 
 
 def perch_request(query: PlanQuery, thrust_ratio: float) -> PerchPlanRequest:
@@ -32,17 +35,26 @@ def powerline_request(query: PlanQuery) -> PowerlinePlanRequest:
 
 
 def plan_answer(plan: PerchPlan | PowerlinePlan | Unavailable) -> Plan | Refusal:
-    """Return a planner's answer as a plan or a refusal."""
+    """Return a planner's answer as a plan or a refusal; what is invalid is refused."""
     if isinstance(plan, Unavailable):
         return Refusal(plan.reason)
     if not plan.success or plan.trajectory is None:
         return Refusal(plan.message or "no reason was given")
     trajectory = plan.trajectory
-    if isinstance(plan, PerchPlan):
-        return Plan(trajectory, trajectory.duration)
-    if plan.recovery_start < 0.0:  # a perch alone, which the planner offers where it finds no recovery
-        return Refusal(plan.message)
-    return Plan(trajectory, plan.perch_time or plan.recovery_time, AtEnd(plan.at_end), plan.recovery_start)
+    duration, at_end, recovery_start = trajectory.duration, AtEnd.CONTACT, -1.0
+    if isinstance(plan, PowerlinePlan):
+        if plan.recovery_start < 0.0:  # a perch alone, which the planner offers where it finds no recovery
+            return Refusal(plan.message)
+        if isinstance(trajectory, FlatTrajectory):
+            return Refusal("invalid plan: trajectory: polynomials, not states")
+        if problem := limits.LIMITS[TrajectoryOrder]["at_end"].problem(plan.at_end):
+            return Refusal(f"invalid plan: at_end: {problem}")
+        duration, at_end, recovery_start = plan.perch_time or plan.recovery_time, AtEnd(plan.at_end), plan.recovery_start
+    if not 0.0 < duration <= trajectory.duration + _ROUNDING:
+        return Refusal(f"invalid plan: perch after {duration:g} s, in a trajectory of {trajectory.duration:g} s")
+    if problem := limits.problem(TrajectoryOrder(0, trajectory, at_end, recovery_start=recovery_start)):
+        return Refusal(f"invalid plan: {problem}")
+    return Plan(trajectory, duration, at_end, recovery_start)
 
 
 def flown_order(id: int, plan: Plan, contact_time: float) -> TrajectoryOrder:

@@ -60,9 +60,13 @@ class Targets:
             return "its stamp is in the future"
         if self.lines is not None and lines.stamp < self.lines.stamp:
             return "it is older than the newest"
+        ids = set[int]()
         try:
             for line in lines.lines:
                 _ = line.segment  # raises where it is none
+                if line.id in ids:
+                    return f"two lines have the id {line.id}"
+                ids.add(line.id)
         except PerchError as error:
             return str(error)
         self.lines = lines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 
@@ -193,6 +194,7 @@ class Inputs:
     cancel: bool = False
     imu_period: float = NOMINAL_PERIOD  # [s]
     way_out: Plan | Refusal | None = None
+    controller_time: float = math.inf  # stamp of the controller's state [s]
 
 
 @dataclass(frozen=True)

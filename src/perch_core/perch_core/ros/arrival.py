@@ -70,7 +70,7 @@ class ArrivalNode(ComponentNode):
 
     def _send_request(self, port: Client[Any, Any], send: Send, request: Any, due: int) -> None:
         """Send a component's request; its answer arrives when it does, whatever `due`."""
-        send(request, partial(self.wiring.enter, self.guarded, port.name, port.handler(self.component)))
+        send(request, partial(self.wiring.enter, self.guarded, port.name, port.handler(self.component), request))
 
     # -- diagnostics and priority --------------------------------------------------------------------------------------
 

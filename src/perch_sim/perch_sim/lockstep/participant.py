@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Timer, ports, run_now
@@ -258,7 +259,7 @@ class LocalParticipant(Participant):
         channel, take = port.channel(self.component), port.handler(self.component)
 
         def send(request: Any, due: int = 0) -> None:
-            self._awaited.append(_Awaited(due, take, self._send_request(channel, request)))
+            self._awaited.append(_Awaited(due, partial(take, request), self._send_request(channel, request)))
 
         return send
 
