@@ -87,7 +87,8 @@ _UNIT = re.compile(rf"_({'|'.join(UNITS)})(?=_|$)")
 
 
 def _timeline(flight: Flight) -> list[tuple[float, str]]:
-    rows = [(t, f"mission commands {Command(c.command).name.lower()}: {c.reason}") for t, c in flight.values("controller/command")]
+    commands = {one.value: one.name.lower() for one in Command}  # of any node: the number if it is unknown
+    rows = [(t, f"mission commands {commands.get(c.command, c.command)}: {c.reason}") for t, c in flight.values("controller/command")]
     started = set()
     for _, order in flight.values("trajectory"):
         kind = {0: "move", 1: "perch", 2: "landing", 3: "powerline perch with recovery"}[order.at_end]
@@ -103,7 +104,7 @@ def _timeline(flight: Flight) -> list[tuple[float, str]]:
             last = status.message
     states = {0: "leaves", 1: "attached to", 2: "bounced off", 3: "collided with", 4: "on"}
     for t, contact in flight.values("contact"):
-        rows.append((t, f"contact (truth): {states[contact.state]} {contact.body}" + (f", {contact.reason}" if contact.reason else "")))
+        rows.append((t, f"contact (truth): {states.get(contact.state, contact.state)} {contact.body}" + (f", {contact.reason}" if contact.reason else "")))
     return sorted(rows)
 
 
