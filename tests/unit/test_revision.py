@@ -154,6 +154,19 @@ def test_the_front_page_shows_what_the_pages_of_results_say():
     assert len(readme.splitlines()) <= 200
 
 
+@pytest.mark.parametrize("commits, codes, words", [
+    (["1234567"], ["0123456789ab"], "commit 1234567"), (["1234567"], ["ba9876543210"], "commit 1234567, older than the code"),
+    (["1234567+"], ["0123456789ab"], "commit 1234567+"), (["1234567", "7654321+"], [""], "commits 1234567, 7654321+, older than the code")])
+def test_the_front_page_names_the_commit_as_the_page_of_results_does(tmp_path, monkeypatch, commits, codes, words):
+    monkeypatch.setattr(revision, "digest", lambda: "0123456789ab")
+    monkeypatch.setattr(front_page, "root", lambda: tmp_path)
+    folder = tmp_path / "docs" / "results"
+    folder.mkdir(parents=True)
+    (folder / "README.md").write_text(f"# Results\n\n{revision.banner(commits, codes)}\n")
+    (folder / "results.json").write_text('{"sections": []}')
+    assert front_page.table().startswith(f"| condition ([{words}](docs/results/README.md)) |")
+
+
 @pytest.mark.skipif(not NOW, reason="not in a git repository")
 def test_the_pictures_of_the_front_page_are_of_this_code_or_said_to_be_older():
     readme = (RESULTS.parents[1] / "README.md").read_text()

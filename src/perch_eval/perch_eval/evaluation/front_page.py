@@ -37,12 +37,12 @@ def table() -> str:
     page = Path("docs/results/README.md")
     rows = {(section["key"], row["name"]): row
             for section in json.loads((root() / page).with_name("results.json").read_text())["sections"] for row in section["rows"]}
-    commit = re.search(r"Of commit ([0-9a-f]{7})", (root() / page).read_text())
+    commit = re.search(r"\*\*Of (commits? [^*\n]+)\*\*", (root() / page).read_text())
     if commit is None:
         raise LookupError(f"{page}: no commit")
     missing = {"paper": "", "ours": "not evaluated", "verdict": MISSING}
     found = ((title, rows.get((key, name), missing)) for title, key, name in ROWS)
-    lines = document.table(f"condition ([commit {commit[1]}]({page})) | paper | ours | verdict", (
+    lines = document.table(f"condition ([{commit[1]}]({page})) | paper | ours | verdict", (
         (title, row["paper"] or "-", row["ours"], row["verdict"].lower()) for title, row in found))
     return "\n".join(lines) + "\n"
 
