@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from perch_core import config
 from perch_core.errors import PerchError
-from perch_core.values import ImuSample, RatesThrust
+from perch_core.values import ImuSample, OdometryState, RatesThrust
 from perch_core.vehicle import Battery, load_vehicle
 from perch_eval.flight import Flight
 from perch_eval.identification import command, responses
@@ -19,7 +19,7 @@ LAG, GAIN, DELAY, THRUST_LAG, THRUST_GAIN, DRAG = (0.05, 0.04, 0.11), (1.0, 0.9,
 PERIOD, FINE = 0.002, 20  # of commands and IMU [s]; steps of the test's own integration in one
 
 
-def record(size=2.5, seconds=20.0, seed=1, oscillation=0.0):
+def record(size=2.5, seconds=20.0, seed=1, oscillation=0.0, lags=LAG, gains=GAIN, delay=DELAY):
     """Commands held for a period, answers integrated in fine steps, IMU samples that are means over a period, with noise."""
     rng, n = np.random.default_rng(seed), round(seconds / PERIOD)
     command_t = PERIOD * np.arange(n)
@@ -27,10 +27,10 @@ def record(size=2.5, seconds=20.0, seed=1, oscillation=0.0):
     u = np.stack([np.convolve(rng.standard_normal(n), smooth / np.sqrt(np.sum(smooth**2)), "same") for _ in range(4)], axis=1) * size
     u[:, 3] = 9.81 + u[:, 3]
     fine = PERIOD / FINE
-    held = u[np.clip((np.arange(n * FINE) - round(DELAY / fine)) // FINE, 0, None)]
-    wanted, answer, speed = held * (*GAIN, THRUST_GAIN), np.zeros((n * FINE, 4)), np.zeros((n, 3))
+    held = u[np.clip((np.arange(n * FINE) - round(delay / fine)) // FINE, 0, None)]
+    wanted, answer, speed = held * (*gains, THRUST_GAIN), np.zeros((n * FINE, 4)), np.zeros((n, 3))
     start = np.array([0.0, 0.0, 0.0, 9.81 * THRUST_GAIN])
-    for i, lag in enumerate((*LAG, THRUST_LAG)):
+    for i, lag in enumerate((*lags, THRUST_LAG)):
         if oscillation:  # dx += fine (w^2 (wanted - x) - 0.1 w dx), then x += fine dx
             spring, damping = (fine * oscillation)**2, 0.1 * fine * oscillation
             b, a = [spring], [1.0, spring + damping - 2.0, 1.0 - damping]
@@ -124,9 +124,39 @@ def test_rotors_are_identified_from_their_speeds():
     assert found["thrust_coefficient"].value == pytest.approx(scale * vehicle.thrust_coefficient, rel=0.01)
 
 
+@pytest.mark.parametrize("true, words", [
+    ({"delay": 0.14, "lags": (0.03, 0.04, 0.11)}, "the delay is at the bound of its fit, 0.1 s"),
+    ({"lags": (0.7, 0.04, 0.11), "size": 4.0}, "the lag is at the bound of its fit, 0.5 s"),
+    ({"gains": (0.17, 0.9, 1.05)}, "the gain is at the bound of its fit, 0.2")])
+def test_a_fit_that_ends_at_a_bound_is_none(true, words):
+    assert [one.reason for one in rates(record(seconds=12.0, **true), 0)[0]] == [words] * 3
+
+
+def test_why_the_delay_is_not_identified_is_said():
+    found, _ = identify(record(seconds=12.0, delay=0.14), VEHICLE)
+    assert "the delay is at the bound of its fit, 0.1 s" in next(one.reason for one in found if one.key == "actuation.delay")
+
+
 def test_a_flight_without_commands_is_refused():
     with pytest.raises(PerchError, match="no imu/data_raw"):
         record_of(Flight({}))
+
+
+def hover(gyro=0.0, thrust=9.81):
+    """A flight of 10 s whose gyroscope, and whose command, have a value of their own at 5 s."""
+    t, zero, C = 0.01 * np.arange(1000), (0.0, 0.0, 0.0), np.zeros((6, 6))
+    own = np.arange(1000) == 500
+    return Flight({
+        "odometry": [(s, OdometryState(round(1e9 * s), (0.0, 0.0, float(s > 0.5)), (0.0, 0.0, 0.0, 1.0), zero, zero, C, C)) for s in t],
+        "imu/data_raw": [(s, ImuSample(round(1e9 * s), (gyro if one else 0.0, 0.0, 0.0), (0.0, 0.0, 9.81))) for s, one in zip(t, own)],
+        "rates_thrust_command": [(s, RatesThrust(round(1e9 * s), True, zero, thrust if one else 9.81)) for s, one in zip(t, own)]})
+
+
+@pytest.mark.parametrize("wrong, words", [({"gyro": np.nan}, "gyro is not finite in 1 of"), ({"thrust": np.inf}, "thrust is not finite in 1 of")])
+def test_a_flight_with_values_that_are_not_finite_is_refused(wrong, words):
+    assert record_of(hover()).t.size > 500
+    with pytest.raises(PerchError, match=words):
+        record_of(hover(**wrong))
 
 
 @pytest.mark.slow

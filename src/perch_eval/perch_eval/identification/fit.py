@@ -31,6 +31,7 @@ MIN_VOLTAGE_RANGE = 0.08  # between the greatest and the least voltage, as a sha
 MAX_MISFIT = 0.03    # of the thrust at a voltage from its curve, as a share
 MAX_RELATIVE_SIGMA = 0.2  # standard deviation of an identified value, as a share of it
 MAX_DELAY_SIGMA = 0.003   # of an identified delay [s]
+AT_BOUND = 1e-3      # distance from a bound of a fit, as a share of its range, within which the bound determines the parameter
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,32 @@ class Estimate:
         return f"{self.key:32s} {self.value:10.4g} +- {self.sigma:.2g} {self.unit}{reason}"
 
 
-def _fit_parameters(model: Callable[[np.ndarray], np.ndarray], measured: np.ndarray, start: Sequence[float], low: Sequence[float],
-                    high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Fit the parameters of `model`; return them and their standard deviations: scatter of fits to parts / sqrt(their number)."""
+@dataclass(frozen=True)
+class Parameter:
+    """Parameter of a fit: name, unit, start and bounds."""
+
+    name: str
+    unit: str
+    start: float
+    low: float
+    high: float
+
+
+LAG, GAIN = Parameter("lag", "s", 0.04, 1e-3, 0.5), Parameter("gain", "", 1.0, 0.2, 5.0)
+RATE_OFFSET, DELAY = Parameter("offset", "rad/s", 0.0, -0.5, 0.5), Parameter("delay", "s", 0.005, -0.01, 0.1)
+DRAG, BIAS = Parameter("drag / mass", "1/s", 0.1, -5.0, 5.0), Parameter("bias", "m/s^2", 0.0, -2.0, 2.0)
+
+
+def _fit_parameters(model: Callable[[np.ndarray], np.ndarray], measured: np.ndarray,
+                    parameters: Sequence[Parameter]) -> tuple[np.ndarray, np.ndarray, str]:
+    """Fit the parameters of `model`.
+
+    Returns:
+        Their values; their standard deviations: scatter of fits to parts / sqrt(their number); and why the fit is none: a
+        parameter at its bound, of which the scatter tells nothing; empty: it is one.
+    """
+    start, low, high = np.array([(one.start, one.low, one.high) for one in parameters]).T
+
     def fit(samples: slice, x0: Sequence[float] | np.ndarray) -> np.ndarray:
         return least_squares(lambda x: (model(x) - measured)[samples], x0, bounds=(low, high),
                              x_scale=np.maximum(np.abs(start), 1e-2), diff_step=1e-4).x
@@ -66,7 +90,9 @@ def _fit_parameters(model: Callable[[np.ndarray], np.ndarray], measured: np.ndar
     weight = np.array([np.var(measured[a:b]) for a, b in zip(cuts, cuts[1:])])  # a part without motion has no information
     weight /= max(weight.sum(), 1e-12)
     spread = np.sqrt(weight @ (parts - whole) ** 2)
-    return whole, spread * np.sqrt(np.sum(weight**2))
+    at_bound = (f"the {one.name} is at the bound of its fit, {bound:g} {one.unit}".rstrip() for one, value in zip(parameters, whole)
+                for bound in (one.low, one.high) if abs(value - bound) < AT_BOUND * (one.high - one.low))
+    return whole, spread * np.sqrt(np.sum(weight**2)), next(at_bound, "")
 
 
 def _estimate(key: str, value: float, sigma: float, unit: str, reason: str, bound: float | None = None) -> Estimate:
@@ -78,11 +104,14 @@ def _estimate(key: str, value: float, sigma: float, unit: str, reason: str, boun
     return Estimate(key, float(value), float(sigma), unit, reason)
 
 
-def _not_identifiable(response: Response, min_size: float) -> str:
-    """Return why a loop is not identifiable: commands below `min_size` (1 sigma), or a poor fit of the model; empty: it is."""
+def _not_identifiable(response: Response, min_size: float, at_bound: str) -> str:
+    """Return why a loop is not identifiable: commands below `min_size` (1 sigma), a parameter at its bound, or a poor fit of the
+    model; empty: it is."""
     size = float(np.std(response.command))
     if size < min_size:
         return f"commands of {size:.2g} {response.unit} (1 sigma) are too small; {min_size:g} are needed"
+    if at_bound:
+        return at_bound
     if response.explained < MIN_EXPLAINED:
         return f"a first-order lag explains {100 * response.explained:.0f} % of the response; {100 * MIN_EXPLAINED:.0f} are needed"
     return ""
@@ -105,10 +134,9 @@ def rates(record: Record, axis: int, delay: float | None = None, spread: float =
         applied_delay = x[3] if free else known
         return first_order_lag(x[1] * record.commands_at(sent, applied_delay + h), x[0], h) + x[2]
 
-    n = 4 if free else 3
-    x, sigma = _fit_parameters(model, w, (0.04, 1.0, 0.0, 0.005)[:n], (1e-3, 0.2, -0.5, -0.01)[:n], (0.5, 5.0, 0.5, 0.1)[:n])
+    x, sigma, at_bound = _fit_parameters(model, w, (LAG, GAIN, RATE_OFFSET, *([DELAY] if free else [])))
     response = Response(f"rate about {'xyz'[axis]}", "rad/s", record.t, record.commands_at(sent, 0.0), w, model(x))
-    reason = _not_identifiable(response, MIN_RATE)
+    reason = _not_identifiable(response, MIN_RATE, at_bound)
     estimates = [_estimate(f"actuation.rate_lag[{axis}]", x[0], float(np.hypot(sigma[0], spread)), "s", reason),
                  _estimate(f"actuation.rate_gain[{axis}]", x[1], sigma[1], "", reason)]
     return estimates + ([_estimate("actuation.delay", max(x[3], 0.0), sigma[3], "s", reason, MAX_DELAY_SIGMA)] if free else []), response
@@ -128,15 +156,15 @@ def thrust(record: Record, vehicle: Vehicle, delay: float, spread: float = 0.0) 
         specific_thrust = gain * unit * np.sum(first_order_lag(u, lag, h) ** 2, axis=1) if rotors else first_order_lag(gain * u, lag, h)
         return specific_thrust - drag * record.v_B[:, 2]
 
-    x, sigma = _fit_parameters(model, f, (0.04, 1.0, 0.05), (1e-3, 0.2, -5.0), (0.5, 5.0, 5.0))
+    x, sigma, at_bound = _fit_parameters(model, f, (LAG, GAIN, DRAG))
     command = unit * np.sum(u**2, axis=1) if rotors else u
     response = Response("specific thrust", "m/s^2", record.t, command, f, model(x))
-    reason = _not_identifiable(response, MIN_THRUST)
+    reason = _not_identifiable(response, MIN_THRUST, at_bound)
     scale = vehicle.thrust_coefficient if rotors else 1.0
     gain_sigma = float(np.hypot(sigma[1], x[1] * vehicle.imu.accel_bias_init / GRAVITY))  # the accelerometer's bias looks like thrust
     return [_estimate(keys[0], x[0], float(np.hypot(sigma[0], spread)), "s", reason),
             _estimate(keys[1], scale * x[1], scale * gain_sigma, "N s^2/rad^2" if rotors else "", reason),
-            _drag(2, vehicle.mass * x[2], vehicle.mass * sigma[2], record)], response
+            _drag(2, vehicle.mass * x[2], vehicle.mass * sigma[2], record, at_bound)], response
 
 
 def battery(voltages: Sequence[float], gains: Sequence[Estimate], applied_exponent: float = 0.0) -> Estimate:
@@ -174,14 +202,14 @@ def drag(record: Record, vehicle: Vehicle, axis: int) -> Estimate:
     def model(x: np.ndarray) -> np.ndarray:
         return x[1] - x[0] * record.v_B[:, axis]
 
-    x, sigma = _fit_parameters(model, record.accel[:, axis], (0.1, 0.0), (-5.0, -2.0), (5.0, 2.0))
-    return _drag(axis, vehicle.mass * x[0], vehicle.mass * sigma[0], record)
+    x, sigma, at_bound = _fit_parameters(model, record.accel[:, axis], (DRAG, BIAS))
+    return _drag(axis, vehicle.mass * x[0], vehicle.mass * sigma[0], record, at_bound)
 
 
-def _drag(axis: int, value: float, sigma: float, record: Record) -> Estimate:
+def _drag(axis: int, value: float, sigma: float, record: Record, at_bound: str) -> Estimate:
     speed = float(np.std(record.v_B[:, axis]))
     reason = f"speeds of {speed:.2g} m/s (1 sigma) are too small; {MIN_SPEED:g} are needed" if speed < MIN_SPEED else ""
-    return _estimate(f"drag[{axis}]", value, sigma, "N s/m", reason or ("a negative drag" if value < 0.0 else ""))
+    return _estimate(f"drag[{axis}]", value, sigma, "N s/m", reason or at_bound or ("a negative drag" if value < 0.0 else ""))
 
 
 def identify(record: Record, vehicle: Vehicle) -> tuple[list[Estimate], list[Response]]:
@@ -191,7 +219,8 @@ def identify(record: Record, vehicle: Vehicle) -> tuple[list[Estimate], list[Res
     delay, spread = vehicle.actuation.delay, 0.0
     if record.rates is not None:
         # One delay for all: that of roll and pitch, which turn the thrust; a larger delay of yaw counts as its lag.
-        tilt = [part[2] for part, _ in (rates(record, axis) for axis in (0, 1)) if not part[2].reason]
+        delays = [rates(record, axis)[0][2] for axis in (0, 1)]
+        tilt = [one for one in delays if not one.reason]
         spread = inf
         if tilt:
             delay = float(np.mean([one.value for one in tilt]))
@@ -199,8 +228,8 @@ def identify(record: Record, vehicle: Vehicle) -> tuple[list[Estimate], list[Res
         axes = [rates(record, axis, delay, spread) for axis in range(3)]
         responses += [response for _, response in axes]
         estimates += [one for part, _ in axes for one in part]
-        estimates.append(_estimate("actuation.delay", delay, spread, "s", "" if tilt else "not identifiable from roll or pitch",
-                                   MAX_DELAY_SIGMA))
+        reason = "" if tilt else f"not identifiable from roll or pitch: {delays[0].reason}"
+        estimates.append(_estimate("actuation.delay", delay, spread, "s", reason, MAX_DELAY_SIGMA))
     if record.thrust is not None or record.rotor_speeds is not None:
         part, response = thrust(record, vehicle, delay, spread)
         estimates, responses = [*estimates, *part[:2], drag(record, vehicle, 0), drag(record, vehicle, 1), part[2]], [*responses, response]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -58,7 +58,7 @@ def record_of(flight: Flight) -> Record:
     """Return the record of a flight.
 
     Raises:
-        PerchError: IMU, odometry or commands are missing, or the time in the air is too short.
+        PerchError: IMU, odometry or commands are missing or not finite, or the time in the air is too short.
     """
     commands = {channel: [(t, c) for t, c in flight.values(channel) if c.armed]
                 for channel in ("rates_thrust_command", "attitude_thrust_command", "motor_command")}
@@ -83,8 +83,13 @@ def record_of(flight: Flight) -> Record:
     velocity = np.array([value.v_B for _, value in sorted(flight.values("odometry"), key=lambda pair: pair[0])])
     v_B = interpolated(t[keep], states.t, velocity)
     rotors = channel == "motor_command"
-    return Record(
+    record = Record(
         t[keep], w[keep], f[keep], v_B, command_t,
         rates=np.array([c.w_B for _, c in sent]) if channel == "rates_thrust_command" else None,
         thrust=None if rotors else np.array([c.thrust for _, c in sent]),
         rotor_speeds=np.array([c.rotor_speed for _, c in sent]) if rotors else None)
+    for one in fields(record):
+        values = getattr(record, one.name)
+        if values is not None and not np.isfinite(values).all():
+            raise PerchError(f"the flight's {one.name} is not finite in {np.count_nonzero(~np.isfinite(values))} of {values.size} values")
+    return record
