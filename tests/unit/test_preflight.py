@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from perch_core.camera import PinholeCamera
+from perch_core.errors import PerchError
 from perch_core.urdf import fixed_frames
 from perch_core.values import CameraModel, ControllerStatus, ImuSample
 from perch_core.vehicle import load_vehicle
@@ -168,14 +169,15 @@ def test_motors_start_only_where_the_propellers_are_off():
     assert {check.verdict for check in command.active_checks(graph, asked("--takeover", "--watchdog"))} == {OPEN} and not graph.commands
     seen = verdicts(command.active_checks(graph, ALL))
     assert [seen[name] for name in ("armed state", "disarming", "kill", "pilot's takeover", "watchdog")] == [PASSED] * 5
-    assert graph.commands[-1] == command.Command.KILL, "it is left with the motors off"
+    assert graph.commands[-2:] == [command.Command.KILL, command.Command.DISARM], "it is left with the motors off"
 
 
 def test_who_does_not_arm_fails_and_is_not_tried_further():
     graph = Graph(obeys=False)
     seen = verdicts(command.active_checks(graph, ALL))
     assert seen["armed state"] is FAILED and seen["watchdog"] is seen["pilot's takeover"] is OPEN
-    assert graph.commands == [command.Command.ARM, command.Command.DISARM, command.Command.ARM]
+    sent = command.Command
+    assert graph.commands == [sent.ARM, sent.DISARM, sent.ARM, sent.KILL, sent.DISARM]
 
 
 @pytest.mark.parametrize("turned, armed, verdict", [(True, True, PASSED), (True, None, FAILED), (True, False, OPEN), (False, None, OPEN)])
@@ -186,6 +188,19 @@ def test_motors_that_go_on_though_the_pilot_has_taken_over_fail(turned, armed, v
 @pytest.mark.parametrize("motion, verdict", [(10.3, PASSED), (11.5, FAILED), (None, OPEN)])
 def test_motors_that_go_on_without_commands_fail(motion, verdict):
     assert checks.check_watchdog(10.0, motion).verdict is verdict
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, PerchError])
+@pytest.mark.parametrize("wait", ["await_takeover", "await_end_of_commands"])
+def test_a_check_that_is_interrupted_leaves_the_motors_off(wait, error):
+    def interrupted(timeout):
+        raise error
+
+    graph = Graph()
+    setattr(graph, wait, interrupted)
+    with pytest.raises(error):
+        command.active_checks(graph, ALL)
+    assert graph.commands[-3:] == [command.Command.ARM, command.Command.KILL, command.Command.DISARM]
 
 
 def test_an_autopilot_may_descend_before_its_motors_stop():

@@ -79,10 +79,22 @@ def rotation_check(listener: Any, vehicle: Vehicle, camera: str | None, sensors:
 
 
 def active_checks(listener: Any, arguments: argparse.Namespace, bound: float = checks.STOP_TIME) -> list[Check]:
-    """Check arming, disarming, kill, the pilot's takeover and watchdog, with the props off; `bound`: see `checks.check_watchdog`."""
+    """Check arming, disarming, kill, the pilot's takeover and watchdog, with the props off; `bound`: see `checks.check_watchdog`.
+
+    The motors are off at the end, also after an interrupt.
+    """
     if not arguments.props_off:
         return [Check(name, Verdict.OPEN, "the motors were not started", "take the propellers off, and add --props-off")
                 for name in ("armed state", "disarming", "kill", "pilot's takeover", "watchdog")]
+    try:
+        return _props_off_checks(listener, arguments, bound)
+    finally:
+        listener.send_command(Command.KILL, State.FAILED)
+        listener.send_command(Command.DISARM, State.DISARMED)
+
+
+def _props_off_checks(listener: Any, arguments: argparse.Namespace, bound: float) -> list[Check]:
+    """Return the checks of `active_checks`; the controller may be left armed."""
     found = [checks.check_command("armed state", listener.send_command(Command.ARM, State.ARMED), State.ARMED, True),
              checks.check_command("disarming", listener.send_command(Command.DISARM, State.DISARMED), State.DISARMED, False)]
     takeover, watchdog = (False, None), (None, None)
@@ -98,7 +110,6 @@ def active_checks(listener: Any, arguments: argparse.Namespace, bound: float = c
     if arguments.watchdog and listener.send_command(Command.ARM, State.ARMED).armed:
         print(f"armed: stop the controller's process now (within {USER_TIMEOUT:g} s) ...", flush=True)
         watchdog = listener.await_end_of_commands(USER_TIMEOUT)
-        listener.send_command(Command.KILL, State.FAILED)
     return [*found, checks.check_takeover(*takeover), checks.check_watchdog(*watchdog, bound)]
 
 
