@@ -325,7 +325,7 @@ def test_preflight_sees_whether_the_pilot_takes_over(vehicle, switched):
     """The node and the firmware, without the graph between them and preflight."""
     node, got = component(vehicle)
     listener = object.__new__(GraphListener)
-    listener.values = {channel: [] for channel in CHANNELS}
+    listener.values, listener._namespace = {channel: [] for channel in CHANNELS}, ""
 
     def spin_for(duration):
         last = time.monotonic() + duration

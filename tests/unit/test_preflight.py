@@ -7,13 +7,15 @@ import cv2
 import numpy as np
 import pytest
 from perch_core.camera import PinholeCamera
+from perch_core.component import Diagnostics
 from perch_core.errors import PerchError
 from perch_core.urdf import fixed_frames
-from perch_core.values import CameraModel, ControllerStatus, ImuSample
+from perch_core.values import CameraModel, ControllerStatus, ImuSample, MotorCommand, RotorState
 from perch_core.vehicle import load_vehicle
 from perch_eval.preflight import checks, command
 from perch_eval.camera_turns import CameraTurns, rotation_between
 from perch_eval.preflight.checks import CommandResult, Verdict
+from perch_eval.preflight.ros import listener
 from scipy.spatial.transform import Rotation
 
 VEHICLE = load_vehicle("snapdragon")
@@ -188,6 +190,61 @@ def test_motors_that_go_on_though_the_pilot_has_taken_over_fail(turned, armed, v
 @pytest.mark.parametrize("motion, verdict", [(10.3, PASSED), (11.5, FAILED), (None, OPEN)])
 def test_motors_that_go_on_without_commands_fail(motion, verdict):
     assert checks.check_watchdog(10.0, motion).verdict is verdict
+
+
+class Bench(listener.GraphListener):
+    """The listener, in place of whose graph the clock and the messages are the test's: motor commands every 0.1 s until 3 s."""
+
+    def __init__(self, monkeypatch, said, namespace=""):
+        """said: time [s] -> (channel, value) of each message of that time."""
+        self.values = {channel: [] for channel in listener.CHANNELS}
+        self._speed_max, self._namespace, self._said, self._now = 1000.0, namespace, said, 0.0
+        monkeypatch.setattr(listener.time, "monotonic", lambda: self._now)
+
+    def spin_for(self, duration):
+        self._now += duration
+        sent = [("motor_command", MotorCommand(0, self._now < 2.95, (0.0,) * 4))] if self._now < 3.05 else []
+        for channel, value in (*sent, *self._said(self._now)):
+            self.values[channel].append((self._now, value))
+
+
+def rotors(speed):
+    return [("rotor_state", RotorState(0, (speed,) * 4, (0.0,) * 4))]
+
+
+def armed(armed, node="/betaflight"):
+    return [("/diagnostics", Diagnostics(0, {"node": node, "armed": str(armed)}))]
+
+
+@pytest.mark.parametrize("said, snapdragon, autopilot", [
+    (lambda t: rotors(500.0 * (t < 3.5)), PASSED, PASSED), (lambda t: armed(t < 3.5), PASSED, PASSED),
+    (lambda t: rotors(500.0 * (t < 6.0)), FAILED, PASSED), (lambda t: rotors(500.0), FAILED, FAILED), (lambda t: armed(True), FAILED, FAILED),
+    (lambda t: rotors(0.0), OPEN, OPEN), (lambda t: armed(False), OPEN, OPEN), (lambda t: [], OPEN, OPEN),
+    (lambda t: rotors(500.0) if t < 3.5 else [], OPEN, OPEN), (lambda t: armed(True) if t < 3.5 else [], OPEN, OPEN),
+    (lambda t: rotors(500.0 * (t < 2.0)), OPEN, OPEN), (lambda t: rotors(500.0 * (t > 3.5)), OPEN, OPEN)])
+def test_the_watchdog_is_judged_by_motors_that_turned_until_the_last_command_and_were_seen_to_stop(monkeypatch, said, snapdragon, autopilot):
+    ends = Bench(monkeypatch, said).await_end_of_commands(60.0)
+    assert checks.check_watchdog(*ends).verdict is snapdragon
+    assert checks.check_watchdog(*ends, checks.DESCENT_TIME).verdict is autopilot
+
+
+def test_another_vehicle_is_not_taken_for_this_one(monkeypatch):
+    """`quad1` stays armed; `quad2` is disarmed at 1 s, by its pilot."""
+    def said(t):
+        return armed(True, "/quad1/betaflight") + armed(t < 1.0, "/quad2/betaflight")
+
+    assert checks.check_takeover(*Bench(monkeypatch, said, "quad1").await_takeover(2.0)).verdict is FAILED
+    assert checks.check_takeover(*Bench(monkeypatch, said, "quad2").await_takeover(2.0)).verdict is PASSED
+    assert checks.check_takeover(*Bench(monkeypatch, said).await_takeover(2.0)).verdict is OPEN
+    assert checks.check_watchdog(*Bench(monkeypatch, said, "quad1").await_end_of_commands(60.0)).verdict is FAILED
+
+
+def test_each_node_of_a_vehicle_is_a_source_of_its_own(monkeypatch):
+    """One says that the motors stop, the other one that they go on."""
+    def said(t):
+        return armed(True, "/mavlink") + armed(t < 1.0, "/betaflight")
+
+    assert checks.check_takeover(*Bench(monkeypatch, said).await_takeover(2.0)).verdict is FAILED
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, PerchError])

@@ -239,8 +239,8 @@ def check_watchdog(last_command: float | None, last_motion: float | None, bound:
     if last_command is None:
         return Check(title, Verdict.OPEN, "commands did not end", advice)
     if last_motion is None:
-        return Check(title, Verdict.OPEN, "no source reports whether the motors turn (rotor_state, or `armed` in /diagnostics)",
-                     "watch the motors")
+        return Check(title, Verdict.OPEN, "no source reports that the motors turned until the last command and stopped after it (rotor_state, "
+                     "or `armed` in /diagnostics)", "stop the controller while the motors turn; without a source, watch the motors")
     return make_check(title, last_motion - last_command <= bound,
                       f"the motors stopped {last_motion - last_command:.2f} s after the last command",
                       f"they must stop within {bound:g} s: do not fly until they do")

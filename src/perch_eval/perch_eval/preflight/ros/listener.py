@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from copy import copy
 from functools import partial
 from typing import Any
@@ -14,7 +15,7 @@ from perch_core.values import ControllerCommand, RotorState
 from perch_core.vehicle import Vehicle
 from perch_eval.nodes import in_namespace
 from perch_eval.camera_turns import CameraTurns
-from perch_eval.preflight.checks import RESPONSE_TIME, CommandResult
+from perch_eval.preflight.checks import DESCENT_TIME, RESPONSE_TIME, CommandResult
 from perch_eval.ros.graph_node import GraphNode
 
 COMMANDS = ("motor_command", "rates_thrust_command", "attitude_thrust_command")
@@ -24,6 +25,22 @@ MAX_VALUES = 20_000    # of a channel
 QUEUE_DEPTH = 2000     # messages that wait while this program does not run
 TURNING_SHARE = 0.02   # of its highest speed: a rotor that is faster turns
 SETTLING_TIME = 0.3    # after an effect, until the commands are checked [s]
+
+Reports = list[tuple[float, bool]]
+"""(Arrival [s], whether the motors turn) of one source, in order."""
+
+
+def last_motion(sources: Sequence[Reports], last: float) -> float | None:
+    """Return when a motor turned last [s], at the earliest with the last command at `last` [s]; None: no source tells it.
+
+    A source tells it if its motors turned when the commands ended, and it reported their stop, or their turning beyond every bound.
+    """
+    def tells(reports: Reports) -> bool:
+        before = [turns for arrival, turns in reports if arrival <= last]
+        newest, still_turns = reports[-1]
+        return bool(before) and before[-1] and (not still_turns or newest > last + DESCENT_TIME)
+
+    return max((max(arrival, last) for reports in sources if tells(reports) for arrival, turns in reports if turns), default=None)
 
 
 class GraphListener(GraphNode):
@@ -38,7 +55,7 @@ class GraphListener(GraphNode):
         super().__init__("preflight", in_namespace(namespace))
         self.values: dict[str, list[tuple[float, Any]]] = {channel: [] for channel in CHANNELS}
         self.turns: CameraTurns | None = None
-        self._speed_max = vehicle.speed_max
+        self._speed_max, self._namespace = vehicle.speed_max, namespace.strip("/")
         for channel in CHANNELS:
             row = topics.topic(channel)
             profile = copy(row.qos.subscribe)
@@ -94,18 +111,17 @@ class GraphListener(GraphNode):
         return CommandResult(self.newest("controller/status"), delay, sent[-1].armed if sent else None)
 
     def await_end_of_commands(self, timeout: float) -> tuple[float | None, float | None]:
-        """Wait for the last command; return its time, and that of the last turning of a motor [s]; see `checks.stopped`."""
-        end = time.monotonic() + timeout
-        while time.monotonic() < end:
+        """Wait for the last command; return its time, and that of the last turning of a motor [s]; see `checks.check_watchdog`."""
+        begun = time.monotonic()
+        while time.monotonic() < begun + timeout:
             self.spin_for(0.1)
             last = max((self.values[channel][-1][0] for channel in COMMANDS if self.values[channel]), default=None)
-            if last is not None and time.monotonic() - last > 3.0 * RESPONSE_TIME:
-                reports = [entry for source in self._motor_reports(last) for entry in source]
-                return last, max((arrival for arrival, turns in reports if turns), default=last) if reports else None
+            if last is not None and time.monotonic() - last > DESCENT_TIME + RESPONSE_TIME:
+                return last, last_motion(self._motor_reports(begun), last)
         return None, None
 
     def await_takeover(self, timeout: float) -> tuple[bool, bool | None]:
-        """Return whether the motors turned, and whether armed commands continued when they stopped; see `checks.taken_over`."""
+        """Return whether the motors turned, and whether armed commands continued when they stopped; see `checks.check_takeover`."""
         begun, turned = time.monotonic(), False
         while time.monotonic() < begun + timeout:
             self.spin_for(0.1)
@@ -117,10 +133,14 @@ class GraphListener(GraphNode):
                 return True, any(sent)
         return turned, None
 
-    def _motor_reports(self, since: float) -> list[list[tuple[float, bool]]]:
-        """Return (arrival [s], whether the motors turn) of each source since a time [s]; sources without values are left out."""
+    def _motor_reports(self, since: float) -> list[Reports]:
+        """Return the reports of each source since a time [s]; sources without reports are left out. Each
+        node in the namespace that has `armed` in its diagnostics is a source."""
         rotors: list[tuple[float, RotorState]] = [entry for entry in self.values["rotor_state"] if entry[0] > since]
         turning = [(arrival, max(state.speed) > TURNING_SHARE * self._speed_max) for arrival, state in rotors]
-        armed = [(arrival, str(status.values["armed"]).lower() == "true") for arrival, status in self.values["/diagnostics"]
-                 if arrival > since and "armed" in status.values]
-        return [reports for reports in (turning, armed) if reports]
+        armed: dict[str, Reports] = {}
+        for arrival, status in self.values["/diagnostics"]:  # of all vehicles
+            node = str(status.values.get("node", ""))
+            if arrival > since and "armed" in status.values and node.rpartition("/")[0].strip("/") == self._namespace:
+                armed.setdefault(node, []).append((arrival, str(status.values["armed"]).lower() == "true"))
+        return [reports for reports in (turning, *armed.values()) if reports]
