@@ -10,8 +10,9 @@ import pytest
 from perch_eval import soak
 
 
-def flights(memory, descriptors=lambda k: 10, good=lambda k: True):
-    return [soak.Flight(float(k), "perched" if good(k) else "missed", good(k), "", {"all": soak.Sample(memory(k), descriptors(k), 5)}, 1.0)
+def flights(memory, descriptors=lambda k: 10, good=lambda k: True, shared=lambda k: 1.0):
+    return [soak.Flight(float(k), "perched" if good(k) else "missed", good(k), "", {"all": soak.Sample(memory(k), descriptors(k), 5)},
+                        shared(k))
             for k in range(150)]
 
 
@@ -19,12 +20,25 @@ def test_what_grows_is_found():
     assert soak.find_problems(flights(lambda k: 100.0 + min(k, 50))) == []  # what grows at first only
     assert soak.find_problems(flights(lambda k: 100.0 + 0.02 * k)) == ["all: memory grows by 2.00 MB per 100 flights"]
     assert soak.find_problems(flights(lambda k: 100.0, lambda k: 10 + (k > 140))) == ["all: descriptors between 10 and 11"]
+    assert soak.find_problems(flights(lambda k: 100.0, shared=lambda k: 1.0 + 0.03 * k)) == ["/dev/shm grows by 3.00 MB per 100 flights"]
     assert soak.find_problems(flights(lambda k: 100.0, good=lambda k: k != 7)) == ["flight 8: missed, no departure: "]
 
 
 def test_a_slope_needs_flights():
     assert soak.slope([1.0] * 60) is None
     assert soak.slope([0.5 * k for k in range(200)]) == pytest.approx(50.0)
+
+
+@pytest.mark.parametrize("flown, judged", [(10, False), (69, False), (70, True)])
+def test_a_soak_that_is_too_short_for_growth_says_so(tmp_path, monkeypatch, capsys, flown, judged):
+    def fly(*arguments):
+        return flights(lambda k: 100.0)[:flown]
+
+    monkeypatch.setattr(soak, "fly", fly)
+    monkeypatch.setattr(soak, "plot", lambda _, file: file.touch())
+    assert soak.main(["--out", str(tmp_path), "--logs", str(tmp_path)]) == 0
+    for text in (capsys.readouterr().out.lower(), (tmp_path / "README.md").read_text().lower()):
+        assert ("too few flights" in text) is (f"too few flights to judge growth of memory: {flown}, 70 are needed" in text) is not judged
 
 
 def test_a_process_is_sampled():

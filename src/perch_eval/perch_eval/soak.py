@@ -34,10 +34,11 @@ EXAMPLES = """examples:
   python3 scripts/soak.py --scenario line_80 --flights 10
   python3 scripts/soak.py --cameras --hours 0.1 --name cameras
 
-exit code: 0 every perch and departure succeeded, and nothing grows; 1 otherwise; 2 invalid input; 130 interrupted (what has been
-flown is written)"""
+exit code: 0 every perch and departure succeeded, and nothing grows (memory is judged from 70 flights on); 1 otherwise; 2 invalid input;
+130 interrupted (what has been flown is written)"""
 WARM_UP_FLIGHTS = 50          # after which memory must not grow
-MAX_GROWTH = 1.0              # of a process per 100 flights [MB]
+JUDGED_FLIGHTS = 20           # after these, that growth is judged by at least
+MAX_GROWTH = 1.0              # of a process, or of /dev/shm, per 100 flights [MB]
 READY_TIMEOUT = 180.0         # [s]
 MAX_CONSECUTIVE_FAILURES = 5  # after which it ends
 SAVE_EVERY = 20               # flights after which what has been measured is written
@@ -86,9 +87,9 @@ def sample(pid: int) -> Sample:
 
 
 def slope(values: Sequence[float]) -> float | None:
-    """Return the growth per 100 flights, without the first `SETTLED`, by least squares; None if there are too few flights."""
+    """Return the growth per 100 flights, without the first `WARM_UP_FLIGHTS`, by least squares; None if there are too few flights."""
     rest = np.asarray(values[WARM_UP_FLIGHTS:], float)
-    return float(100.0 * np.polyfit(np.arange(len(rest)), rest, 1)[0]) if len(rest) >= 20 else None
+    return float(100.0 * np.polyfit(np.arange(len(rest)), rest, 1)[0]) if len(rest) >= JUDGED_FLIGHTS else None
 
 
 def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: float, flights: int | None, folder: Path,
@@ -171,12 +172,21 @@ def find_problems(flights: Sequence[Flight]) -> list[str]:
     found = [f"flight {k + 1}: {flight.outcome}{'' if flight.departed else ', no departure'}: {flight.words}"
              for k, flight in enumerate(flights) if not flight.departed or flight.outcome != "perched"]
     for name, figures in growth(flights).items():
-        if figures["slope_MB_per_100"] is not None and figures["slope_MB_per_100"] > MAX_GROWTH:
-            found.append(f"{name}: memory grows by {figures['slope_MB_per_100']:.2f} MB per 100 flights")
+        found += _growing(f"{name}: memory", figures["slope_MB_per_100"])
         for what in ("descriptors", "threads"):
             low, high = figures[what]
             found += [f"{name}: {what} between {low} and {high}"] if low != high else []
-    return found
+    return found + _growing("/dev/shm", slope([flight.shared for flight in flights]))
+
+
+def _growing(what: str, per_100: float | None) -> list[str]:
+    return [] if per_100 is None or per_100 <= MAX_GROWTH else [f"{what} grows by {per_100:.2f} MB per 100 flights"]
+
+
+def not_judged(flights: int) -> list[str]:
+    """Return, as one line, that so many flights are too few to judge the growth of memory; empty: they are enough."""
+    needed = WARM_UP_FLIGHTS + JUDGED_FLIGHTS
+    return [f"too few flights to judge growth of memory: {flights}, {needed} are needed"] if flights < needed else []
 
 
 def plot(flights: Sequence[Flight], file: Path) -> None:
@@ -204,9 +214,9 @@ def page(folder: Path) -> str:
     runs = {file: json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))}
     text = ["# Soak", "", banner([run["commit"] for run in runs.values()], [run.get("digest", "") for run in runs.values()]), "",
             "This page is generated. Each run is of the stack over ROS in lockstep: perch, depart, perch again. Growth of memory by",
-            f"least squares over the flights after the first {WARM_UP_FLIGHTS}; required: at most {MAX_GROWTH:g} MB per 100 flights, "
-            "descriptors and threads",
-            "constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
+            f"least squares over the flights after the first {WARM_UP_FLIGHTS}; required: at most {MAX_GROWTH:g} MB per 100 flights "
+            "(of /dev/shm,",
+            "too), descriptors and threads constant. Memory is what a process has resident; /dev/shm is that of the whole machine."]
     for file, run in runs.items():
         good = sum(flight["departed"] and flight["outcome"] == "perched" for flight in run["flights"])
         sight = "with cameras" if run["cameras"] else "without cameras (error models in their place)"
@@ -216,15 +226,19 @@ def page(folder: Path) -> str:
                  f"{good} of {len(run['flights'])} flights perched and departed, {minutes:.1f} min of simulated time in "
                  f"{run['wall_s'] / 60.0:.1f} min.",
                  "", *table("process | first [MB] | last [MB] | growth [MB per 100 flights] | descriptors | threads", (
-                     (name, f"{figures['rss_first_MB']:.1f}", f"{figures['rss_last_MB']:.1f}",
-                      "too few flights" if figures["slope_MB_per_100"] is None else f"{figures['slope_MB_per_100']:+.2f}",
+                     (name, f"{figures['rss_first_MB']:.1f}", f"{figures['rss_last_MB']:.1f}", _growth_text(figures["slope_MB_per_100"]),
                       *(f"{low}" if low == high else f"{low} to {high}" for low, high in (figures["descriptors"], figures["threads"])))
                      for name, figures in run["growth"].items()))]
         shared = [flight["shared"] for flight in run["flights"]]
         bad = _grouped(run["problems"])
         verdict = ["Problems:", "", *(f"* {problem}" for problem in bad)] if bad else ["No problems."]
-        text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB.", *verdict, "", f"![{file.stem}]({file.stem}.png)", "", f"*{CAPTION}*"]
+        verdict += [line for words in not_judged(len(shared)) for line in ("", f"{words.capitalize()}.")]
+        text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB, growth per 100 flights [MB]: {_growth_text(slope(shared))}.", *verdict, "", f"![{file.stem}]({file.stem}.png)", "", f"*{CAPTION}*"]
     return "\n".join(text) + "\n"
+
+
+def _growth_text(per_100: float | None) -> str:
+    return "too few flights" if per_100 is None else f"{per_100:+.2f}"
 
 
 def _grouped(problems: list[str]) -> list[str]:
@@ -264,7 +278,7 @@ def _soak(args: argparse.Namespace) -> int:
     if not flights:
         raise PerchError(f"no flight was flown; logs: {args.logs}")
     problems = write(flights)
-    print(f"{args.out / 'README.md'}: {len(flights)} flights", *problems, sep="\n  ")
+    print(f"{args.out / 'README.md'}: {len(flights)} flights", *problems, *not_judged(len(flights)), sep="\n  ")
     return 1 if problems else 0
 
 
