@@ -233,7 +233,8 @@ def page(folder: Path) -> str:
         bad = _grouped(run["problems"])
         verdict = ["Problems:", "", *(f"* {problem}" for problem in bad)] if bad else ["No problems."]
         verdict += [line for words in not_judged(len(shared)) for line in ("", f"{words.capitalize()}.")]
-        text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB, growth per 100 flights [MB]: {_growth_text(slope(shared))}.", *verdict, "", f"![{file.stem}]({file.stem}.png)", "", f"*{CAPTION}*"]
+        text += ["", f"/dev/shm: {min(shared):.1f} to {max(shared):.1f} MB, growth per 100 flights [MB]: {_growth_text(slope(shared))}.", *verdict,
+                 "", f"![{file.stem}]({file.stem}.png)", "", f"*{CAPTION}*"]
     return "\n".join(text) + "\n"
 
 
