@@ -7,8 +7,11 @@ import os
 
 import numpy as np
 import pytest
+from unit.recorded_flights import flown, record
+
 from perch_core.ros import topics
-from perch_core.values import NANOSECONDS, CameraImage, ControllerStatus, MotorCommand, OdometryState, Serialized, TargetPose, TrajectoryOrder
+from perch_core.values import (
+    NANOSECONDS, CameraImage, Contact, ControllerCommand, ControllerStatus, MotorCommand, OdometryState, Serialized, TargetPose, TrajectoryOrder)
 from perch_core.trajectory import rest_to_rest
 from perch_eval.flight import Flight, timed
 from perch_eval.mcap_log import read
@@ -209,6 +212,14 @@ def test_a_report_for_which_there_is_no_room_is_not_half_written_and_the_outcome
     assert demo.main([]) == 2
     said = capsys.readouterr()
     assert "outcome: perched" in said.out and "cannot be written: No space left" in said.err and "Traceback" not in said.err
+
+
+def test_a_flight_with_a_command_and_a_contact_that_are_unknown_has_a_report(tmp_path):
+    contact = Contact(2 * NANOSECONDS, 9, "wall", 0.0, 0.0, 0.0, 0.0, "")
+    record(tmp_path / "flight.mcap", flown() | {"controller/command": [(1.0, ControllerCommand(NANOSECONDS, 77, "by hand"))], "contact": [(2.0, contact)]})
+    build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
+    page = (tmp_path / "report.html").read_text()
+    assert "mission commands 77: by hand" in page and "contact (truth): 9 wall" in page
 
 
 def test_a_report_of_a_recording_without_truth_or_estimate_is_written(tmp_path):

@@ -20,7 +20,7 @@ from unit.recorded_flights import BIAS, PATH, flown, record
 
 from perch_core.urdf import urdf
 from perch_core.values import (
-    AtEnd, ControllerCommand, TrajectoryOrder)
+    AtEnd, TrajectoryOrder)
 from perch_core.vehicle import load_vehicle
 from perch_eval import comparison, plots, report
 from perch_eval.camera_clip import clip
@@ -34,7 +34,6 @@ from perch_eval.replay.command import main
 from perch_eval.replay.stroboscope import stroboscope
 from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.scene_3d import scene_3d
-from perch_sim.scenario import load_scenario
 
 
 def test_a_recording_is_the_flight_that_was_flown(recorded):
@@ -132,13 +131,6 @@ def test_a_replanned_trajectory_is_distinct_from_one_that_starts():
     assert [text for _, text in report._timeline(Flight({"trajectory": timed(orders)}))] == [
         f"trajectory 5 (powerline perch with recovery) {verb} {PATH.duration:.2f} s, of which {PATH.duration - 1.2:.2f} s are recovery"
         for verb in ("starts, takes", "is re-planned, what remains takes")]
-
-
-def test_a_flight_with_an_unknown_command_has_a_report(tmp_path):
-    channels = flown()
-    record(tmp_path / "flight.mcap", channels | {"controller/command": [(1.0, ControllerCommand(1_000_000_000, 77, "by hand"))]})
-    report.build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
-    assert "mission commands 77: by hand" in (tmp_path / "report.html").read_text()
 
 
 def test_the_clip_shows_what_the_cameras_saw_around_the_perch_at_the_speed_of_the_flight(recorded):
