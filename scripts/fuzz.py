@@ -11,7 +11,7 @@ from perch_setup import ROOT, command_parser, enter, quiet_on_interrupt
 from perch_setup.enter import INTERRUPTED
 
 EXAMPLES = """examples:
-  python3 scripts/fuzz.py files                          a minute of mutated vehicles, scenarios, boards, campaigns, problems, parameter files
+  python3 scripts/fuzz.py files                          a minute of mutated vehicles, scenarios, boards, campaigns, problems, parameter files, recordings
   python3 scripts/fuzz.py files --minutes 20 --seed 7
   python3 scripts/fuzz.py messages --minutes 20          values into every port of every component
   python3 scripts/fuzz.py services --cases /tmp/found    requests to the planners, the mission, the controller

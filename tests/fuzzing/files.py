@@ -25,6 +25,7 @@ from perch_core.errors import PerchError
 from perch_core.isolated import IsolatedRunner
 from perch_core.tag_board import TagBoard, load_board
 from perch_core.vehicle import Vehicle, load_vehicle
+from perch_eval import mcap_log
 from perch_eval.campaign.specification import RUNS_MAX, Campaign, load_campaign
 from perch_eval.flyable import check_flight
 from fuzzing.report import Report
@@ -44,9 +45,10 @@ class Nonsense(PerchError):
 
 
 def kinds() -> dict[str, list[Path]]:
-    """Kind -> the repository's files of it. Parameter files are a kind each, as in `parameters.vio`."""
+    """Kind -> the repository's files of it. Parameter files are a kind each, as in `parameters.vio`; the recording is of these tests."""
     folder = config.config_dir()
     found = {kind.removesuffix("s"): sorted((folder / kind).glob("*.yaml")) for kind in ("vehicles", "scenarios", "boards", "campaigns", "problems")}
+    found["recording"] = [Path(__file__).with_name("recording.mcap")]
     return found | {f"parameters.{node}": [folder / f"{node}.yaml"] for node in COMPONENTS if (folder / f"{node}.yaml").exists()}
 
 
@@ -73,6 +75,13 @@ def load(kind: str, path: Path) -> Any:
             problem = config.from_mapping(PowerlineProblem, mapping, str(path))
             return problem, problem.request(load_vehicle(problem.vehicle))
         return read_problem(mapping, str(path))
+    if kind == "recording":
+        damage: list[str] = []
+        values = [*mcap_log.read(path, damage.append)]
+        mcap_log.recover(path, path.with_suffix(".copy"))
+        if damage:
+            raise PerchError(damage[0])
+        return values
     parameters = config.flattened(parameters_in(path, path.stat().st_mtime_ns))
     own = {name: value for name, value in parameters.items() if name not in HOST_PARAMETERS}
     return config.from_mapping(component_class(kind.removeprefix("parameters."), own).config_type, config.nested(own), str(path))
@@ -247,11 +256,12 @@ def run(minutes: float, seed: int, report: Report) -> None:
         report.begin()
         while report.going():
             kind = rng.choice(list(files))
-            content = mutated(rng.choice(files[kind]).read_bytes(), rng)
+            file = rng.choice(files[kind])
+            content = mutated(file.read_bytes(), rng)
             try:
                 report.tried(runner.submit(Job(judge, (kind, content), then=id, limit=HUNG)).result(2 * HUNG))
             except (Nonsense, JobFailed, JobStopped, TimeoutError) as error:
                 if "not begun" not in str(error):
-                    report.found(f"{kind}.yaml", content, f"{kind}: {error!s:.5000}")
+                    report.found(f"{kind}{file.suffix}", content, f"{kind}: {error!s:.5000}")
     finally:
         runner.close()

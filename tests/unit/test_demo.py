@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from perch_core.errors import PerchError
+from perch_eval import demo
 from perch_eval.demo import _replaced
 
 
@@ -43,3 +46,16 @@ def test_a_flight_that_ends_leaves_its_own_recording_or_none(tmp_path, records):
         if records:
             recording.write_text("new")
     assert [path.read_text() for path in tmp_path.iterdir()] == ["new"] * records
+
+
+def test_flights_into_many_folders_leave_no_files_open(tmp_path, monkeypatch):
+    def refused(*_, **__):
+        raise PerchError("no programs")
+
+    monkeypatch.setattr(demo, "check_flight", lambda *_: None)
+    monkeypatch.setattr(demo, "programs", refused)
+    before = len(os.listdir("/proc/self/fd"))
+    for k in range(20):
+        with pytest.raises(PerchError, match="no programs"):
+            demo.fly("surface_90", 1, tmp_path / str(k))
+    assert len(os.listdir("/proc/self/fd")) == before

@@ -259,6 +259,27 @@ def test_results_are_resumed_with_the_same_vehicle_and_code_only(tmp_path, monke
         assert ("other settings or code" in capsys.readouterr().err) == (end == 2)
 
 
+def test_flights_of_a_campaign_whose_results_are_gone_are_not_taken_for_those_of_the_next_one(tmp_path, capsys):
+    report = tmp_path / "flights" / "run_00000" / "report.html"
+    report.parent.mkdir(parents=True)
+    report.write_text("another flight")
+    for arguments in ([], ["--resume"]):
+        assert campaign.main(["contact", "--runs", "1", "--out", str(tmp_path), *arguments]) == 2
+        assert f"error: {tmp_path / 'flights'} holds flights of an earlier campaign" in capsys.readouterr().err
+    assert report.read_text() == "another flight" and not (tmp_path / "results.jsonl").exists()
+
+
+def test_results_are_resumed_with_the_same_own_engine_only(tmp_path, monkeypatch, capsys):
+    engine = tmp_path / "engine_of_a_campaign.py"
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(campaign, "digest", lambda: "0123")
+    monkeypatch.setattr(campaign, "fly_all", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    for text, end in (("fly = 1", 130), ("fly = 1", 130), ("fly = 2", 2)):
+        engine.write_text(text)
+        assert campaign.main(["contact", "--engine", "engine_of_a_campaign:fly", "--runs", "1", "--out", str(tmp_path / "out"), "--resume"]) == end
+        assert ("other settings or code" in capsys.readouterr().err) == (end == 2)
+
+
 @pytest.mark.parametrize("damage", [
     "folder", b"no results at all\n" * 100, b"\xff\n", b"[" * 100_000 + b"\n", {"values": None}, {"metrics": [1]}, {"seed": "x"},
     {"metrics": {"a": []}}, {"more": 1}])

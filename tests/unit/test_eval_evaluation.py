@@ -6,6 +6,7 @@ import math
 import os
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.campaign.engines import Task
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
-from perch_eval.evaluation import command, control, kept
+from perch_eval.evaluation import command, control, inspection, kept, planning_times
 from perch_eval.evaluation.cable import cable_of_length
 from perch_eval.evaluation.nonlinear import solve
 from perch_eval.evaluation.planning_times import SETTINGS, waypoint_problem
@@ -215,3 +216,25 @@ def test_a_comparison_with_a_flight_that_was_not_begun_is_written(tmp_path, monk
     monkeypatch.setattr(control, "cached_figures", known)
     sections = control.comparison_sections(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1))
     assert len(sections) == 1 and "not begun: refused" in (tmp_path / "comparison.md").read_text()
+
+
+@pytest.mark.parametrize("count, collisions, verdict", [(3, 0, "vacuous"), (3, 1, "FAILS"), (20, 0, "holds"), (20, 1, "FAILS")])
+def test_few_inspections_without_a_collision_do_not_show_what_many_do(tmp_path, monkeypatch, count, collisions, verdict):
+    def known(effort, name, jobs, fly, good):
+        return [{"seed": seed, "reference_collisions": 2, "collisions": collisions * (seed == 1), "collisions_without": 2, "reference_px": 100.0,
+                 "flown_px": 10.0, "clearance": 1.0, "cheirality": 1.0, "segment": 1.0, "completed": True} for seed in jobs]
+
+    monkeypatch.setattr(inspection, "cached_figures", known)
+    section = inspection._layouts(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), count, {}))
+    assert next(row for row in section.rows if row.name == "collisions").verdict == verdict
+
+
+@pytest.mark.parametrize("factor, verdict", [(7.7, "worse"), (140.0, "better")])
+def test_the_ratio_of_planning_times_is_compared_with_the_papers(tmp_path, monkeypatch, factor, verdict):
+    """The paper's: 527 ms / 4 ms with 3 waypoints, 1253 ms / 18 ms with 10."""
+    iteration = SimpleNamespace(program=None)
+    found = SimpleNamespace(solved=True, solve_time=1e-3, iterations=[iteration])
+    monkeypatch.setattr(planning_times, "_fastest", lambda *_: found)
+    monkeypatch.setattr(planning_times, "solve", lambda *_: SimpleNamespace(converged=True, solve_time=factor * 1e-3))
+    section = planning_times._table(Effort(False, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1, {}), load_vehicle("snapdragon"))
+    assert {row.verdict for row in section.rows if "/ QP" in row.name} == {verdict}

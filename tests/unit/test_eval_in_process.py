@@ -39,6 +39,15 @@ def test_a_flight_without_vio_does_not_take_off():
     assert max(truth.p_WB[2] for truth in trace.values("ground_truth/odometry")) < 0.2
 
 
+def test_a_flight_that_breaks_is_closed(monkeypatch):
+    loop, closed = arrange(load_scenario("surface_90"), 1), []
+    monkeypatch.setattr(loop, "step", lambda: 1 // 0)
+    monkeypatch.setattr(loop.vehicle, "close", lambda: closed.append("vehicle"))
+    with pytest.raises(ZeroDivisionError):
+        perch(loop, load_scenario("surface_90"))
+    assert closed == ["vehicle"]
+
+
 def test_a_component_is_replaced_by_its_name():
     scenario = load_scenario("surface_90")
     trace = perch(arrange(scenario, 1, replace={"estimator": TruthEstimator()}), scenario)

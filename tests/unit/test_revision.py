@@ -75,9 +75,29 @@ def test_words_do_not_change_the_digest_and_figures_do(tmp_path, monkeypatch):
     assert first != written('"""Rates."""\n\nRATE = """[Hz]"""\n\n\ndef f():\n    """Says "hello"."""\n')
 
 
+def test_a_module_that_is_not_added_yet_is_part_of_the_code_and_an_ignored_one_is_not(tmp_path, monkeypatch):
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    monkeypatch.setattr(revision, "root", lambda: tmp_path)
+    monkeypatch.setattr(revision, "_other_config", lambda: None)
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src" / "rate.py").touch()
+    (tmp_path / ".gitignore").write_text("*.nbi\n")
+    for command in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "mine"]):
+        subprocess.run([*git, *command], check=True)
+    (tmp_path / "src" / "cache.nbi").touch()
+    digests = [revision.digest()]
+    assert not revision.commit().endswith("+")
+    for text in ("GAIN = 1", "GAIN = 2"):
+        (tmp_path / "src" / "gain.py").write_text(text)
+        digests.append(revision.digest())
+    assert len(set(digests)) == 3 and revision.commit().endswith("+")
+    subprocess.run([*git, "add", "src"], check=True)
+    assert revision.digest() == digests[-1]
+
+
 @pytest.mark.skipif(not revision._git("rev-parse", "HEAD"), reason="not in a git repository")
 def test_the_digest_without_git_is_that_of_the_same_files_with_it(tmp_path, monkeypatch):
-    for name in revision._git("ls-files", *revision.CODE).splitlines():
+    for name in revision._git("ls-files", "--cached", "--others", "--exclude-standard", *revision.CODE).splitlines():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(revision.root() / name, tmp_path / name, follow_symlinks=False)
     now = revision.digest()

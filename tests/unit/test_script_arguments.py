@@ -15,7 +15,7 @@ import bench
 import harness
 import pytest
 import service
-from perch_eval.arguments import output_folder
+from perch_eval.arguments import locked_folder, output_folder
 from ros_graph import commands
 from ros_graph.commands import GraphError, NoAnswerError
 
@@ -204,3 +204,6 @@ def test_a_folder_of_results_belongs_to_one_process_at_a_time(tmp_path):
     refused = another(tmp_path / "out")
     assert refused.returncode == 2 and "another run is writing there" in refused.stderr and len(refused.stderr.splitlines()) == 1
     assert another(tmp_path / "other").returncode == another(tmp_path / "other").returncode == 0  # its end is the end of the lock
+    with locked_folder(tmp_path / "other"), locked_folder(tmp_path / "out"):
+        assert another(tmp_path / "other").returncode == 2
+    assert another(tmp_path / "other").returncode == 0 and another(tmp_path / "out").returncode == 2, "only what was locked here is released"

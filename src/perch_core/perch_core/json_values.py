@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,5 +25,14 @@ def to_text(value: Any) -> str:
 
 
 def write_json(file: Path, value: Any) -> None:
-    """Write a value to a file as `to_text` formats it."""
-    file.write_text(to_text(value))
+    """Write a value to a file as `to_text` formats it; after an error or Ctrl-C, an earlier file is as before.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    draft = file.with_name(f".{os.getpid()}-{file.name}")
+    try:
+        draft.write_text(to_text(value))
+        draft.replace(file)
+    finally:
+        draft.unlink(missing_ok=True)

@@ -16,7 +16,7 @@ from pathlib import Path
 from perch_core.errors import ConfigError, PerchError
 from perch_core.processes import discard_closed_output
 
-_locked: dict[Path, int] = {}  # folder of results -> its open file, whose lock ends with this process
+_locked: dict[Path, int] = {}  # folder of results -> its open file, which holds the lock
 
 
 def count(text: str) -> int:
@@ -90,6 +90,19 @@ def output_folder(path: Path, option: str = "--out") -> Path:
         raise ConfigError(option, str(path), "another run is writing there: wait for its end, or choose another folder") from None
     except OSError as error:
         raise ConfigError(option, str(path), f"cannot be written: {error.strerror}") from None
+
+
+@contextmanager
+def locked_folder(path: Path) -> Iterator[Path]:
+    """Like `output_folder`, but the lock ends with the body, unless this process held it before."""
+    place = path.resolve()
+    held = place in _locked
+    folder = output_folder(path)
+    try:
+        yield folder
+    finally:
+        if not held:
+            os.close(_locked.pop(place))
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 from perch_core.jit import uncompiled
 from perch_core.vehicle import load_vehicle
-from perch_eval.arguments import command, command_parser, open_network, output_folder
+from perch_eval.arguments import command, command_parser, locked_folder, open_network
 from perch_eval.domain import domain_in_environment
 from perch_eval.flyable import check_flight
 from perch_eval.goal import SUCCESSES
@@ -81,16 +81,17 @@ def fly(scenario_name: str, seed: int, out: Path, composed: Collection[str] = FA
     if not 0 <= seed < 2**31:
         raise ConfigError("--seed", str(seed), "is outside [0, 2147483647]")
     on_line = (lambda name, line: print(f"  [{name}] {line}", flush=True)) if verbose else (lambda name, line: None)
-    with domain_in_environment(), _replaced(output_folder(out) / "flight.mcap"):
-        started = programs(scenario, seed, folder=out / "logs", scenario_source=str(source.resolve()), composed=composed, lockstep=not realtime,
-                           record=out / "flight.mcap", hold_for_goal=not realtime)
-        stack = Stack(started, out / "logs", on_line=on_line)
-        print(f"{scenario.name}, seed {seed}: starting {len(started)} processes", flush=True)
-        with stack:
-            from perch_eval.report import build_report  # and with it matplotlib, while the nodes start
-            result = _fly_stack(scenario, stack)
-    return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time,
-                        result.start_time)
+    with locked_folder(out):
+        with domain_in_environment(), _replaced(out / "flight.mcap"):
+            started = programs(scenario, seed, folder=out / "logs", scenario_source=str(source.resolve()), composed=composed, lockstep=not realtime,
+                               record=out / "flight.mcap", hold_for_goal=not realtime)
+            stack = Stack(started, out / "logs", on_line=on_line)
+            print(f"{scenario.name}, seed {seed}: starting {len(started)} processes", flush=True)
+            with stack:
+                from perch_eval.report import build_report  # and with it matplotlib, while the nodes start
+                result = _fly_stack(scenario, stack)
+        return build_report(out, scenario, seed, result.outcome, result.message, result.wall_time, result.end_time,
+                            result.start_time)
 
 
 @contextmanager

@@ -135,5 +135,5 @@ def _read(path: Path, on_damage: Callable[[str], None]) -> Iterator[tuple[mcap.r
     with open(path, "rb") as file:
         try:
             yield from NonSeekingReader(file, validate_crcs=True).iter_messages(log_time_order=False)
-        except (McapError, EOFError, struct.error, ZstdError, CRCValidationError, UnicodeDecodeError) as error:
+        except (McapError, EOFError, struct.error, ZstdError, CRCValidationError, UnicodeDecodeError, OverflowError, MemoryError) as error:
             on_damage(str(error) or type(error).__name__)

@@ -42,7 +42,7 @@ def commit() -> str:
     """Return the commit of the code, with a plus sign if the sources have changed since or PERCH_CONFIG_DIR replaces some of them;
     `unknown` outside a repository."""
     found = _git("rev-parse", "--short=7", "HEAD")
-    return found + "+" * bool(_git("status", "--porcelain", "--untracked-files=no", *CODE) or _other_config()) if found else "unknown"
+    return found + "+" * bool(_git("status", "--porcelain", "--untracked-files=normal", *CODE) or _other_config()) if found else "unknown"
 
 
 def _other_config() -> Path | None:
@@ -63,13 +63,14 @@ def without_docstrings(source: bytes) -> bytes:
 
 
 def digest() -> str:
-    """SHA-256 over all files of `CODE` that git tracks (outside a repository, or without git: all), as they are in the working
-    tree, 12 digits; with PERCH_CONFIG_DIR also over those there.
+    """SHA-256 over all files of `CODE` that git does not ignore (outside a repository, or without git: all), as they are in the
+    working tree, 12 digits; with PERCH_CONFIG_DIR also over those there.
 
     Docstrings do not count: rewording them does not invalidate results.
     """
     total, folder, other = hashlib.sha256(), root(), _other_config()
-    names = _git("ls-files", *CODE).splitlines() or [path.relative_to(folder).as_posix() for path in _walked(*(folder / part for part in CODE))]
+    names = (_git("ls-files", "--cached", "--others", "--exclude-standard", *CODE).splitlines()
+             or [path.relative_to(folder).as_posix() for path in _walked(*(folder / part for part in CODE))])
     for name in sorted([*names, *(str(path) for path in _walked(*([other] if other else [])))]):
         path = folder / name
         content = path.read_bytes() if path.is_file() else b""

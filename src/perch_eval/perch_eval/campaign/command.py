@@ -11,7 +11,7 @@ from pathlib import Path
 
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.causes import ERROR, MEANING, SUCCESS
-from perch_eval.campaign.engines import ENGINES, Task, run_task, resolve
+from perch_eval.campaign.engines import ENGINES, Task, resolve, run_task, source_digest
 from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.results import Results, RunResult, flight_folder, worst
 from perch_eval.campaign.specification import Campaign, load_campaign
@@ -47,7 +47,7 @@ def _run_campaign(args: argparse.Namespace) -> int:
     resolve(campaign.engine)
     out = output_folder(args.out or Path("out") / "campaigns" / campaign.name)
     file = out / "results.jsonl"
-    with closing(Results(file, campaign.name, f"{campaign.digest} {digest()}", args.resume)) as results:
+    with closing(Results(file, campaign.name, f"{campaign.digest} {digest()} {source_digest(campaign.engine)}".strip(), args.resume)) as results:
         try:
             fly_all(campaign, results, args.jobs, args.cluster)
             from perch_eval.campaign.report import write_report  # draws figures: not needed before, nor by workers

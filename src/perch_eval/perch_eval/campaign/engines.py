@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +66,12 @@ def resolve(name: str) -> Callable[[Task], RunResult]:
         return ENGINES.get(name) or resolved(name)
     except (ImportError, AttributeError) as error:
         raise PerchError(f"engine {name!r}: {error}") from None
+
+
+def source_digest(name: str) -> str:
+    """SHA-256 of the file of an own engine, which need not be part of this repository; empty for the engines that are."""
+    file = None if name in ENGINES else getattr(import_module(name.partition(":")[0]), "__file__", None)
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
 
 
 def run_task(task: Task) -> RunResult:

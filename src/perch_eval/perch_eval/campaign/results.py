@@ -41,9 +41,13 @@ class Results:
             resume: continue an earlier campaign from its results.
 
         Raises:
-            ResultsError: the file holds another campaign's results, holds results while `resume` is False, or is damaged.
+            ResultsError: the file holds another campaign's results, holds results while `resume` is False, is damaged, or is missing
+                while flights of an earlier campaign are beside it.
         """
         header, found = read_results(path)
+        kept = path.parent / flight_folder(0).parent
+        if not found and kept.exists():
+            raise ResultsError(f"{kept} holds flights of an earlier campaign whose results are gone: move it away, or choose another --out")
         if header and header.get("digest") != digest:
             raise ResultsError(f"{path} holds results of campaign {header.get('name')!r} with other settings or code: "
                                "choose another --out, or the original settings and code")

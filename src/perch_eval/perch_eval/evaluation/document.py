@@ -64,8 +64,8 @@ def _page(sections: Sequence[Section], made_by: str) -> list[str]:
              f"{found[HOLDS]} claims hold, {found[FAILS]} fail, {found[VACUOUS]} are vacuous; {found[BETTER]} further values are better than the "
              f"paper's, {found[WORSE]} worse; {found[MISSING]} rows are not available.", "",
              *([*table("part | row | value | claim", failures), ""] if failures else []),
-             "*holds*: the claim is true of these flights; *fails*: it is false; *vacuous*: nothing occurred that it is about; *better*, *worse*: "
-             "comparison with the paper, without a claim; *shown*: value without a claim.", "",
+             "*holds*: the claim is true of these flights; *fails*: it is false; *vacuous*: nothing occurred that it is about, or too little; *better*, "
+             "*worse*: comparison with the paper, without a claim; *shown*: value without a claim.", "",
              "**M**: Mao et al., *Aggressive Visual Perching with Quadrotors on Inclined Surfaces*. "
              "**P**: Paneque et al., *Perception-Aware Perching on Powerlines with Multirotors*. "
              "The papers flew in a laboratory, this is simulation: a better value here does not mean a better vehicle.", "", made_by]

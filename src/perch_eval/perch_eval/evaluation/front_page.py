@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 
 from perch_eval.evaluation import document
+from perch_eval.evaluation.powerline import POSITION
 from perch_eval.evaluation.sections import MISSING
 from perch_eval.revision import root
 
@@ -19,8 +20,8 @@ ROWS = (
     ("M, Table III: perches, 90 deg, 1.7 m", "m_table_3", "90 deg, 1.7 m"),
     ("M, Table III: perches, 90 deg, 3 m", "m_table_3", "90 deg, 3 m"),
     ("M, Fig. 6: largest body rate, 90 deg, 1.7 m, setting `surface_90_aggressive`", "m_fig_6", "largest body rate, `surface_90_aggressive`"),
-    ("P, Table I: position error at the cable, 80 deg", "p_table_1_flown", "80 deg: position RMSE"),
-    ("P, Table I: position error at the cable, upside down", "p_table_1_flown", "180 deg: position RMSE"),
+    ("P, Table I: position RMSE at the cable, true against planned place, 80 deg", "p_table_1_flown", f"80 deg: {POSITION}"),
+    ("P, Table I: position RMSE at the cable, true against planned place, upside down", "p_table_1_flown", f"180 deg: {POSITION}"),
     ("perches on the cable, upside down", "p_table_1_flown", "180 deg: gripped the cable"),
     ("P, VI-A: collisions in random inspections", "p_inspection_layouts", "collisions"),
 )

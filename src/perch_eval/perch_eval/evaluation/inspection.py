@@ -14,6 +14,7 @@ from perch_sim.scenario import load_scenario
 
 SCENARIO, SEED = "inspection", 1
 REFERENCE_COLLISIONS = 2
+REQUIRED_LAYOUTS = 20  # fewer flights without a collision do not show what the paper's more than 20 do
 REQUIRED_GAIN = 5.0  # bar and paper: factor by which the mean reprojection error is reduced
 
 
@@ -63,8 +64,10 @@ def _layouts(effort: Effort) -> Section:
                   "twice; flown as above, with the same error models. Without the line terms the same controller follows the reference.")
     collisions, twice = sum(r["collisions"] for r in found), sum(r["reference_collisions"] == REFERENCE_COLLISIONS for r in found)
     ended = sum(r["completed"] for r in found)
+    holds = collisions == 0 and ended == count and twice == count
     out.claim("collisions", f"{collisions} in {count} layouts, {ended} flown to the end", "none in more than 20 experiments",
-              collisions == 0 and ended == count and twice == count, f"0; the reference collides twice in {twice} of {count}")
+              None if holds and count < REQUIRED_LAYOUTS else holds,
+              f"0 in at least {REQUIRED_LAYOUTS} layouts; the reference collides twice in {twice} of {count}")
     out.show("layouts in which the flight without the line terms hits a cable", f"{sum(r['collisions_without'] > 0 for r in found)} of {count}")
     gains = Spread.from_values(r["reference_px"] / r["flown_px"] for r in found)
     means = [float(np.mean([r[key] for r in found])) for key in ("reference_px", "flown_px")]

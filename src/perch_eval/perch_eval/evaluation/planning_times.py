@@ -65,8 +65,9 @@ def _table(effort: Effort, vehicle: Vehicle) -> Section:
         out.show(f"nonlinear program (NLopt SLSQP), {waypoints} waypoints", times.to_text(1.0, 0, "ms"), f"{paper_nlp:g} ms",
                  f"{done} of {len(nonlinear)} converged; durations are given, which the paper's program had to find")
         ratio = times.median / qp.median
-        out.claim(f"nonlinear / QP as printed, {waypoints} waypoints", f"{ratio:.1f} x", f"{paper_nlp / paper_qp:.0f} x", ratio >= 2.0,
-                  "checking after the QP is at least twice as fast as enforcing the bound, though numpy calls are most of its time")
+        out.compare(f"time of the nonlinear program / QP as printed, {waypoints} waypoints", f"{ratio:.1f} x", f"{paper_nlp / paper_qp:.0f} x",
+                    ratio >= paper_nlp / paper_qp,
+                    "both ours, in Python; the paper's are its own two. Better: checking after the QP saves more time than in the paper")
         ours = [found for p in problems if (found := _fastest(planner.plan, replace(p, segment_times=None), vehicle)) is not None]
         out.data[f"shipped_{waypoints}"] = [found.solve_time for found in ours]
         shipped = Spread.from_values(1e3 * found.solve_time for found in ours)

@@ -20,7 +20,7 @@ class Row:
         name: name of the measured quantity.
         ours: our value, with interval or range.
         paper: the paper's value; empty: the paper gives none.
-        verdict: `holds` or `FAILS` for a claim, `vacuous` for a claim about cases that did not occur, `better` or `worse` for a
+        verdict: `holds` or `FAILS` for a claim, `vacuous` for a claim about cases of which too few occurred, `better` or `worse` for a
             comparison without a claim, `shown`, or `not available` if there is no value.
         note: the claim, a remark, or the reason why there is no value.
     """
@@ -53,7 +53,7 @@ class Section:
     data: dict = field(default_factory=dict)
 
     def claim(self, name: str, ours: str, paper: str, holds: bool | None, note: str) -> None:
-        """Add a row with the verdict on a claim; None: there was no case to test it on."""
+        """Add a row with the verdict on a claim; None: there was no case to test it on, or too few that do not contradict it."""
         self.rows.append(Row(name, ours, paper, VACUOUS if holds is None else HOLDS if holds else FAILS, note))
 
     def compare(self, name: str, ours: str, paper: str, better: bool, note: str = "") -> None:

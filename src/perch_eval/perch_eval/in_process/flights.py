@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Collection, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from dataclasses import replace as replaced
 from typing import Any
@@ -111,7 +112,7 @@ def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
     goal = loop.send("mission", goal_of(scenario))
     limit = START + round(scenario.time_limit * NANOSECONDS)
     stamp = 0
-    with without_collector():  # a trace only grows: collecting garbage in it takes a tenth of a flight's time
+    with closing(loop), without_collector():  # a trace only grows: collecting garbage in it takes a tenth of a flight's time
         while goal.result is None and stamp < limit + CANCEL_TIME:
             stamp = loop.step()
             goal.cancel_requested = stamp > limit
@@ -128,5 +129,4 @@ def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
         if trace.outcome == "cancelled" and timed_out:
             trace.outcome = "timeout"
     trace.wall_time = clock.perf_counter() - began
-    loop.close()
     return trace
