@@ -41,7 +41,7 @@ class Recorder(Listener[RecorderParameters]):
 
     config_type = RecorderParameters
 
-    flush = Timer(0.1)
+    flush = Timer(0.1, stamping=True)
 
     def __init__(self, config: RecorderParameters) -> None:
         super().__init__(config)
