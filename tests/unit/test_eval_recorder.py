@@ -255,6 +255,17 @@ def test_before_there_is_time_stamps_are_and_a_late_message_is_logged_when_it_co
     assert [time for _, _, time, _ in read(recording.path)] == [10 * NANOSECONDS, 20 * NANOSECONDS] and recording.lines == []
 
 
+def test_recorders_that_are_started_together_write_files_of_their_own(tmp_path):
+    recorders = [Recorder(RecorderParameters(file=str(tmp_path / "f.mcap"))) for _ in range(2)]
+    for one in recorders:
+        one.warm_up()
+    for one in recorders:
+        one.on_message("odometry", Serialized("/odometry", 0, topics.encode("odometry", state(0)), topics.message_type("odometry")))
+        one.close()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["f.1.mcap", "f.mcap"]
+    assert all(len(RecordedFlight(file).values("odometry")) == 1 for file in tmp_path.iterdir())
+
+
 def test_a_recorder_that_is_started_again_keeps_what_there_is(tmp_path):
     for name in ("f.mcap", "f.1.mcap", "f.2.mcap"):
         recording = Recording(tmp_path / "f.mcap")
