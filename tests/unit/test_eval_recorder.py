@@ -162,11 +162,12 @@ def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path, monkeyp
     recording.fly(range(10))
     recording.recorder.on_flush(0)
     recording.fly(range(10, 20000))
+    assert [s.level for s in said] == [0, 2]
     recording.recorder.on_flush(NANOSECONDS)
     recording.recorder.close()
     assert [line.level for line in recording.lines] == ["error"] and "No space left" in recording.lines[0].text
-    assert [s.level for s in said] == [0, 2]
-    assert "No space left" in said[-1].message
+    assert [s.level for s in said] == [0, 2, 2]
+    assert all("No space left" in s.message for s in said[1:])
     flight = RecordedFlight(path)
     count = len(flight.values("odometry"))
     assert flight.damage and 100 < count < 20000
@@ -228,6 +229,16 @@ def test_how_it_goes_is_told_once_a_second_of_flight(tmp_path):
             recording.recorder.on_flush(k * STEP)
     assert len(said) == 2 and said[-1].values["messages"] > 400
     recording.recorder.close()
+
+
+def test_how_it_goes_is_told_where_the_clock_has_gone_back_too(tmp_path):
+    recording = Recording(tmp_path / "f.mcap")
+    said: list[Diagnostics] = []
+    recording.recorder.diagnostics.receivers.append(said.append)
+    for second in (100, 1, 2):
+        recording.recorder.on_flush(second * NANOSECONDS)
+    recording.recorder.close()
+    assert [one.stamp for one in said] == [100 * NANOSECONDS, NANOSECONDS, 2 * NANOSECONDS]
 
 
 @pytest.mark.parametrize("channel", ["odometry", "/diagnostics"])

@@ -84,10 +84,13 @@ class Recorder(Listener[RecorderParameters]):
                 self._log.flush()
             except OSError as error:
                 self._stop_recording(error)
-        if now - self._last_report >= NANOSECONDS:
-            self._last_report = now
-            level, message = (2, self._failure) if self._failure else (0, "ok")
-            self.diagnostics(Diagnostics(now, {"messages": self._messages}, level, message))
+        if abs(now - self._last_report) >= NANOSECONDS:
+            self._report(now)
+
+    def _report(self, now: int) -> None:
+        self._last_report = now
+        level, message = (2, self._failure) if self._failure else (0, "ok")
+        self.diagnostics(Diagnostics(now, {"messages": self._messages}, level, message))
 
     def close(self) -> None:
         """Finish the file."""
@@ -112,6 +115,7 @@ class Recorder(Listener[RecorderParameters]):
         if log is not None:
             log.abandon()
         self._failure = f"recording stopped: {self._file}: {error.strerror or error}"
+        self._report(self.host_time())
         self.log(LogLine("error", f"{self._failure}; the flight goes on, and what is written can be read"))
 
 
