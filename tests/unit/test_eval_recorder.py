@@ -14,7 +14,7 @@ from perch_eval.flight import Flight, timed
 from perch_eval.mcap_log import read
 from perch_eval import demo
 from perch_eval.report import build_report
-from perch_eval.ros.recorded_flight import RecordedFlight
+from perch_eval.ros.recorded_flight import RecordedFlight, write
 from perch_eval.ros.recorder import CHANNELS, Recorder, RecorderParameters
 from perch_core.component import Diagnostics, Input, ports
 from perch_sim.scenario import load_scenario
@@ -264,6 +264,23 @@ def test_before_there_is_time_stamps_are_and_a_late_message_is_logged_when_it_co
     recording.give("target/pose", TargetPose(10 * NANOSECONDS, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6)))
     recording.recorder.close()
     assert [time for _, _, time, _ in read(recording.path)] == [10 * NANOSECONDS, 20 * NANOSECONDS] and recording.lines == []
+
+
+def test_of_a_recording_across_a_restart_of_time_the_last_flight_is_read_with_a_warning(tmp_path):
+    def flown(steps, x):
+        for k in steps:
+            stamp = k * STEP
+            yield "ground_truth/odometry", stamp, state(k)._replace(p_WB=(x, 0.0, 1.0))
+            yield "motor_command", stamp, MotorCommand(stamp, True, (x,) * 4)
+
+    first, second = list(flown(range(2000), 1.0)), list(flown(range(1000), 2.0))
+    late = [value for value in first[-20:] if value[0] == "motor_command"]  # the recorder reads one topic after the other
+    write(tmp_path / "f.mcap", [*first[:-20], second[0], *late, *second[1:]])
+    flight = RecordedFlight(tmp_path / "f.mcap")
+    assert "time has restarted" in flight.damage and "at 0.000 s" in flight.damage
+    assert flight.states("ground_truth/odometry").p[:, 0].tolist() == [2.0] * 1000
+    assert [command.rotor_speed[0] for _, command in flight.values("motor_command")] == [2.0] * 1000
+    assert flight.vectors("motor_command", lambda command: command.stamp)[0].tolist() == pytest.approx([2e-3 * k for k in range(1000)])
 
 
 def test_recorders_that_are_started_together_write_files_of_their_own(tmp_path):
