@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import time
 from dataclasses import dataclass
 
@@ -103,6 +104,13 @@ def test_words_are_those_of_json():
         "l": {"x": 1, "y": [{"x": 1}]}, "m": "1"}
     value = {"a": [1, 1e-05, -1e22, "x\n\u00e9\"", None, False, {}]}
     assert config.parse_yaml(json.dumps(value), "") == value
+
+
+def test_bytes_of_a_command_line_that_are_no_text_are_refused():
+    text = os.fsdecode(b"mission.name:=\xff")
+    with pytest.raises(ConfigError, match="is not text in UTF-8") as error:
+        config.parse_yaml(text, f"-p {text}")
+    assert str(error.value).isprintable()
 
 
 def test_errors_are_one_line_whatever_they_quote(tmp_path):

@@ -17,7 +17,7 @@ from perch_eval.flight import Flight, timed
 from perch_eval.mcap_log import read
 from perch_eval import demo
 from perch_eval.report import build_report
-from perch_eval.ros.recorded_flight import RecordedFlight
+from perch_eval.ros.recorded_flight import RecordedFlight, write
 from perch_eval.ros.recorder import CHANNELS, Recorder, RecorderParameters
 from perch_core.component import Diagnostics, Input, ports
 from perch_sim.scenario import load_scenario
@@ -165,11 +165,12 @@ def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path, monkeyp
     recording.fly(range(10))
     recording.recorder.on_flush(0)
     recording.fly(range(10, 20000))
+    assert [s.level for s in said] == [0, 2]
     recording.recorder.on_flush(NANOSECONDS)
     recording.recorder.close()
     assert [line.level for line in recording.lines] == ["error"] and "No space left" in recording.lines[0].text
-    assert [s.level for s in said] == [0, 2]
-    assert "No space left" in said[-1].message
+    assert [s.level for s in said] == [0, 2, 2]
+    assert all("No space left" in s.message for s in said[1:])
     flight = RecordedFlight(path)
     count = len(flight.values("odometry"))
     assert flight.damage and 100 < count < 20000
@@ -241,6 +242,16 @@ def test_how_it_goes_is_told_once_a_second_of_flight(tmp_path):
     recording.recorder.close()
 
 
+def test_how_it_goes_is_told_where_the_clock_has_gone_back_too(tmp_path):
+    recording = Recording(tmp_path / "f.mcap")
+    said: list[Diagnostics] = []
+    recording.recorder.diagnostics.receivers.append(said.append)
+    for second in (100, 1, 2):
+        recording.recorder.on_flush(second * NANOSECONDS)
+    recording.recorder.close()
+    assert [one.stamp for one in said] == [100 * NANOSECONDS, NANOSECONDS, 2 * NANOSECONDS]
+
+
 @pytest.mark.parametrize("channel", ["odometry", "/diagnostics"])
 @pytest.mark.parametrize("stamp", [-5 * NANOSECONDS, 2_100_000_000 * NANOSECONDS])
 def test_a_stamp_of_another_clock_moves_no_time(tmp_path, stamp, channel):
@@ -264,6 +275,34 @@ def test_before_there_is_time_stamps_are_and_a_late_message_is_logged_when_it_co
     recording.give("target/pose", TargetPose(10 * NANOSECONDS, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.eye(6)))
     recording.recorder.close()
     assert [time for _, _, time, _ in read(recording.path)] == [10 * NANOSECONDS, 20 * NANOSECONDS] and recording.lines == []
+
+
+def test_of_a_recording_across_a_restart_of_time_the_last_flight_is_read_with_a_warning(tmp_path):
+    def flown(steps, x):
+        for k in steps:
+            stamp = k * STEP
+            yield "ground_truth/odometry", stamp, state(k)._replace(p_WB=(x, 0.0, 1.0))
+            yield "motor_command", stamp, MotorCommand(stamp, True, (x,) * 4)
+
+    first, second = list(flown(range(2000), 1.0)), list(flown(range(1000), 2.0))
+    late = [value for value in first[-20:] if value[0] == "motor_command"]  # the recorder reads one topic after the other
+    write(tmp_path / "f.mcap", [*first[:-20], second[0], *late, *second[1:]])
+    flight = RecordedFlight(tmp_path / "f.mcap")
+    assert "time has restarted" in flight.damage and "at 0.000 s" in flight.damage
+    assert flight.states("ground_truth/odometry").p[:, 0].tolist() == [2.0] * 1000
+    assert [command.rotor_speed[0] for _, command in flight.values("motor_command")] == [2.0] * 1000
+    assert flight.vectors("motor_command", lambda command: command.stamp)[0].tolist() == pytest.approx([2e-3 * k for k in range(1000)])
+
+
+def test_recorders_that_are_started_together_write_files_of_their_own(tmp_path):
+    recorders = [Recorder(RecorderParameters(file=str(tmp_path / "f.mcap"))) for _ in range(2)]
+    for one in recorders:
+        one.warm_up()
+    for one in recorders:
+        one.on_message("odometry", Serialized("/odometry", 0, topics.encode("odometry", state(0)), topics.message_type("odometry")))
+        one.close()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["f.1.mcap", "f.mcap"]
+    assert all(len(RecordedFlight(file).values("odometry")) == 1 for file in tmp_path.iterdir())
 
 
 def test_a_recorder_that_is_started_again_keeps_what_there_is(tmp_path):

@@ -297,7 +297,7 @@ def test_a_damaged_recording_is_said_to_be_one(recorded, tmp_path, capsys):
     for program, arguments in ((main, [str(damaged)]), (comparison.main, [str(path), str(damaged), "--out", str(tmp_path / "page.html")])):
         assert program(arguments) == 2
         said = capsys.readouterr().err
-        assert "cut off or damaged" in said and "holds no ground_truth/odometry as far as it can be read" in said
+        assert "not read as a whole" in said and "holds no ground_truth/odometry as far as it can be read" in said
 
 
 def test_a_folder_stands_for_its_recording(recorded, tmp_path):

@@ -255,6 +255,20 @@ def test_what_cannot_be_loaded_is_told(jobs: ModuleType) -> None:
         runner.close()
 
 
+def test_jobs_of_a_process_that_the_system_refuses_to_start_fail_at_once(jobs: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    runner = IsolatedRunner(command=("/nonexistent",))
+    try:
+        for _ in range(2):
+            with pytest.raises(JobFailed, match="did not start: .*No such file"):
+                submit(runner, jobs.double, 1, limit=None).result(20.0)
+        with pytest.raises(JobFailed, match="No such file"):
+            runner.wait_ready()
+        monkeypatch.setattr(runner, "_command", isolated.COMMAND)  # the system has recovered
+        assert submit(runner, jobs.double, 21).result(120.0) == 42
+    finally:
+        runner.close()
+
+
 def test_the_processes_end_with_a_caller_that_is_killed(jobs: ModuleType) -> None:
     caller = Path(str(jobs.__file__)).with_name("caller.py")
     caller.write_text("""

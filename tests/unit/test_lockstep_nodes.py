@@ -9,7 +9,9 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from perch_core.component import Action, Client, Component, Service, Timer, Unavailable  # noqa: E402
+from perch_core.errors import PerchError  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
 from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult  # noqa: E402
@@ -137,6 +139,27 @@ def test_a_vehicle_names_the_participants_that_do_not_connect(executor, monkeypa
     for waited in (3.1, 4.0, 14.0):
         vehicle._check_start(vehicle._created_at + waited)
     assert warned == [f"lockstep: for {waited} s waiting for estimator, controller to connect" for waited in (3, 14)]
+
+
+def test_a_vehicle_that_fails_in_a_step_says_so_once_and_why(executor, monkeypatch):
+    vehicle = created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=[""])
+    calls, errors, reported = [], [], []
+
+    def advance():
+        calls.append(1)
+        raise PerchError("the state is not finite")
+
+    monkeypatch.setattr(vehicle.component, "advance", advance)
+    monkeypatch.setattr(vehicle, "get_logger", lambda: SimpleNamespace(info=lambda _: None, warning=errors.append, error=errors.append))
+    monkeypatch.setattr(vehicle, "_diagnostics", SimpleNamespace(publish=lambda message: reported.append(message.status[0])))
+    until(executor, lambda: calls)
+    vehicle._advance()
+    vehicle._supervise()
+    vehicle._diagnose()
+    assert len(calls) == 1 and len(errors) == 1 and "the state is not finite" in errors[0]
+    values = {pair.key: pair.value for pair in reported[-1].values}
+    assert reported[-1].level == DiagnosticStatus.ERROR
+    assert values["waiting_for"] == "a new start, as the simulation has failed: PerchError: the state is not finite"
 
 
 def test_a_participant_without_a_vehicle_says_so(executor, monkeypatch):

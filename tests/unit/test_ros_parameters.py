@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import pytest
 import rclpy
@@ -11,7 +12,7 @@ from perch_core.component import Component
 from perch_core.config import choice, derived, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.registry import resolved
-from perch_core.ros.node import node
+from perch_core.ros.node import _warn_unused_parameter_files, node
 from perch_core.ros.parameters import _leaves
 from perch_eval.in_process.parameters import COMPONENTS
 from rclpy.context import Context
@@ -122,10 +123,24 @@ def test_an_accepted_value_counts_at_once_whole_numbers_for_real_ones_too(graph,
     assert (list(config) if isinstance(got, list) else config) == got
 
 
-@pytest.mark.parametrize("name", ["lockstep_timout", "use_sim_timee", "start_type_description_services"])
+@pytest.mark.parametrize("name", ["lockstep_timout", "use_sim_timee", "start_type_description_services", "qos_overrides./odometry.subscription.depth"])
 def test_names_that_begin_as_a_parameter_of_the_host_are_refused(graph, name):
     with pytest.raises(ConfigError, match=name):
         node("mistyped", Tuned).create(context=graph.context, use_global_arguments=False, parameter_overrides=[Parameter(name, value=True)])
+
+
+@pytest.mark.parametrize("section, used", [
+    ("tuned", True), ("/tuned", True), ("/**", True), ("/*", True), ("/**/tuned", True), ("tunde", False), ("/a/tuned", False), ("a: {tuned", False)])
+def test_a_parameter_file_without_a_section_for_the_node_is_warned_of(tmp_path, monkeypatch, graph, section, used):
+    file, warned = tmp_path / "tuned.yaml", []
+    file.write_text(f"{section}: {{ros__parameters: {{count: 5}}}}{'}' * section.count('{')}")
+    monkeypatch.setattr(graph.tuned, "get_logger", lambda: SimpleNamespace(warning=warned.append))
+    arguments = ["--ros-args", "--params-file", str(file)]
+    _warn_unused_parameter_files(arguments, [graph.tuned])
+    assert warned == [f"{file}: not used: its sections are /{section.strip('/').replace(': {', '/')}, none of which is /tuned"] * (not used)
+    other = Node("tuned", context=graph.context, cli_args=arguments, use_global_arguments=False)
+    assert ("count" in other._parameter_overrides) is used
+    other.destroy_node()
 
 
 AUTOPILOTS = {"betaflight": "perch_autopilot.betaflight:Betaflight", "mavlink": "perch_autopilot.mavlink:Mavlink"}

@@ -2,13 +2,14 @@
 
 import time
 from dataclasses import dataclass
+from itertools import pairwise
 
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
 from builtin_interfaces.msg import Time  # noqa: E402
-from perch_core.component import Component, Output  # noqa: E402
+from perch_core.component import Component, Output, Timer  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.node import close_nodes, connect  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
@@ -16,6 +17,7 @@ from rclpy.experimental import EventsExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
+from unit.test_requests_of_nodes import until  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,25 @@ class Listening(Component[Nothing]):
     """Has none."""
 
     config_type = Nothing
+
+
+class Waking(Component[Nothing]):
+    """Keeps the times of its timers."""
+
+    config_type = Nothing
+    wake, stamp = Timer(0.005), Timer(0.005, stamping=True)
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.times, self.stamps = [], []
+
+    def on_wake(self, now):
+        """Keep it."""
+        self.times.append(now)
+
+    def on_stamp(self, now):
+        """Keep it."""
+        self.stamps.append(now)
 
 
 @pytest.fixture
@@ -82,3 +103,27 @@ def test_a_negative_time_is_ignored_and_other_clocks_are_named(context, monkeypa
         executor.shutdown()
         foreign.destroy_node()
         close_nodes([listening, ticking])
+
+
+@pytest.mark.parametrize("step", [10_000_000_000, -5_000_000_000])
+def test_the_time_of_timers_goes_on_where_the_clock_is_set(executor, monkeypatch, step):
+    node = ArrivalNode("waking", Waking, Wiring(), context=executor.context)
+    waking, right, wrong_by = node.component, node.host_time, [0]
+    monkeypatch.setattr(node, "host_time", lambda: right() + wrong_by[0])
+    node.connect()
+    executor.add_node(node)
+    until(executor, lambda: waking.times and waking.stamps)
+    wrong_by[0] = step
+    counted = len(waking.times), len(waking.stamps)
+    until(executor, lambda: len(waking.times) > counted[0] + 4 and len(waking.stamps) > counted[1] + 4)
+    elapsed = [after - before for before, after in pairwise(waking.times)]
+    assert min(elapsed) >= 0 and sum(elapsed) < 4_000_000_000
+    assert max(abs(after - before) for before, after in pairwise(waking.stamps)) > 4_000_000_000
+
+
+def test_without_simulation_time_on_the_clock_the_time_of_timers_goes_on(executor):
+    node = ArrivalNode("waking", Waking, Wiring(), context=executor.context, parameter_overrides=[Parameter("use_sim_time", value=True)])
+    node.connect()
+    executor.add_node(node)
+    until(executor, lambda: len(node.component.times) > 10)
+    assert node.component.times[-1] - node.component.times[0] > 20_000_000 and set(node.component.stamps) == {0}

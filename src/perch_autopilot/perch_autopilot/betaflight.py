@@ -44,7 +44,7 @@ class Betaflight(Component[BetaflightParameters]):
 
     rates_thrust = Input(RatesThrust, "rates_thrust_command")
     command = Input(ControllerCommand, "controller/command")
-    poll = Timer(0.01)
+    poll = Timer(0.01, stamping=True)
     imu = Output(ImuSample, "imu/data_raw")
 
     def __init__(self, config: BetaflightParameters) -> None:

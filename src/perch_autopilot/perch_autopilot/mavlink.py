@@ -80,7 +80,7 @@ class Mavlink(Component[MavlinkParameters]):
     rates_thrust = Input(RatesThrust, "rates_thrust_command")
     command = Input(ControllerCommand, "controller/command")
     odometry = Input(OdometryState, "odometry")
-    poll = Timer(0.005)
+    poll = Timer(0.005, stamping=True)
     imu = Output(ImuSample, "imu/data_raw")
 
     def __init__(self, config: MavlinkParameters) -> None:

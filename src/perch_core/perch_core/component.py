@@ -112,18 +112,19 @@ class Emitter(Generic[V]):
 
 
 class Timer(_Port):
-    """Periodic call of `on_<name>(now)` with the host's time [ns], also while no input arrives.
+    """Periodic call of `on_<name>(now)` with a time [ns] that does not jump where a clock is set, also while no input arrives.
 
-    The host's time may differ from that of the stamps: compare it only with itself.
+    This time may differ from that of the stamps: compare it only with itself.
     """
 
-    def __init__(self, period: float) -> None:
+    def __init__(self, period: float, stamping: bool = False) -> None:
         """
         Args:
             period: interval between calls [s].
+            stamping: `now` is a stamp by the host's clock instead, and jumps where that is set.
         """
         super().__init__("")
-        self.period = period
+        self.period, self.stamping = period, stamping
 
 
 class Service(_Port, Generic[Q, A]):

@@ -190,22 +190,32 @@ class IsolatedRunner:
             return list(self._tasks)
 
     def _start(self) -> None:
-        """Start a supervisor and send it its set-up and preload."""
-        parent_end, child_end = Pipe()
+        """Start a supervisor and send it its set-up and preload; if the system refuses it, all jobs fail."""
         self._ready, self._problem = False, ""
         self._started.clear()
-        with self._lock:
-            if self._closing:
-                return
-            command = [*self._command, str(child_end.fileno()), str(os.getpid())]
-            # BLAS on one thread: so do all nodes, and a process with threads cannot be forked.
-            environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-            self._process = subprocess.Popen(command, pass_fds=(child_end.fileno(),), process_group=0, env=environment)
-        child_end.close()
-        self._pipe = parent_end
+        try:
+            self._pipe, child_end = Pipe()
+            with child_end, self._lock:
+                if self._closing:
+                    return
+                command = [*self._command, str(child_end.fileno()), str(os.getpid())]
+                # BLAS on one thread: so do all nodes, and a process with threads cannot be forked.
+                environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+                self._process = subprocess.Popen(command, pass_fds=(child_end.fileno(),), process_group=0, env=environment)
+        except OSError as error:
+            self._fail_start(str(error))
+            return
         with suppress(OSError):  # it ended already: `_receive_status` finds out
-            parent_end.send(self._setup)
-            parent_end.send_bytes(self._preload)
+            self._pipe.send(self._setup)
+            self._pipe.send_bytes(self._preload)
+
+    def _fail_start(self, reason: str) -> None:
+        """Fail all jobs, as the supervisor could not start."""
+        self._problem = f"the process for isolated jobs did not start: {reason}"
+        self._end()
+        while self._tasks:
+            _fail(self._tasks.popleft(), JobFailed(self._problem))
+        self._started.set()
 
     def _receive_status(self) -> None:
         """Receive the supervisor's report that it is ready, or why not; if it has ended after it was ready, start another one."""
@@ -220,12 +230,9 @@ class IsolatedRunner:
                 return
         if answer == "ready":
             self._ready = True
+            self._started.set()
         else:
-            self._problem = f"the process for isolated jobs did not start: {answer}"
-            self._end()
-            while self._tasks:
-                _fail(self._tasks.popleft(), JobFailed(self._problem))
-        self._started.set()
+            self._fail_start(answer)
 
     def _run(self, task: _Task) -> None:
         """Run one job and complete its future."""

@@ -80,6 +80,8 @@ def parse_yaml(text: str, source: str) -> Any:
         return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         raise ConfigError(source, "", f"is not valid YAML: {error}") from None
+    except UnicodeEncodeError:  # bytes of a command line that are no text
+        raise ConfigError(source, "", "is not text in UTF-8") from None
 
 
 class _OpenCollection:

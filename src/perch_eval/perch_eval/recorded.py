@@ -27,7 +27,7 @@ def read_flight(path: Path, namespace: str = "") -> RecordedFlight:
         raise PerchError(f"{path}: no such recording")
     flight = RecordedFlight(path, namespace)
     if flight.damage:
-        print(f"warning: {path} is cut off or damaged, and read as far as it goes ({flight.damage})", file=sys.stderr)
+        print(f"warning: {path} is not read as a whole: {flight.damage}", file=sys.stderr)
     return flight
 
 

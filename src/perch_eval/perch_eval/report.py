@@ -142,7 +142,7 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
                                 f"{contact['tangential_speed_m_s']:.2f} m/s tangential, tilt error {contact['tilt_error_deg']:.1f} deg, "
                                 f"{100 * contact['offset_m']:.1f} cm from the perch point {contact['reason']}".rstrip()))
     if report["recording_damage"]:
-        rows.append(("recording", f"cut off or damaged ({report['recording_damage']}): the figures are of what can be read"))
+        rows.append(("recording", f"not read as a whole ({report['recording_damage']}): the figures are of what is read"))
     for kind in ("tracking", "estimation"):
         share = report.get(f"{kind}_judged", 1.0)
         rows.append((f"{kind} RMSE x, y, z", _centimetres(report.get(f"{kind}_rmse_m")) +

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 from perch_core.component import Action, Client, Component, Input, Service, Timer, ports
 from perch_core.ros.component_node import ComponentNode
@@ -17,7 +17,7 @@ from perch_core.ros.intake import Intake
 from perch_core.ros.priority import priority
 from perch_core.ros.service_clients import Send, connect_clients
 from perch_core.ros.wiring import Wiring, foreign_publishers
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock, ClockType, ROSClock
 
 CHECK_PERIOD = 1.0  # of the check for foreign publishers, whose messages are ignored [s]
 
@@ -34,6 +34,7 @@ class ArrivalNode(ComponentNode):
         super().__init__(name, component, wiring, **kwargs)
         self._intake = Intake(self)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._steady_offset = self.host_time() - time.monotonic_ns()  # as measured at the start [ns]
         self._deadlines: Deadlines | None = None
         if deadline:
             self._deadlines = deadlines = Deadlines()
@@ -53,7 +54,13 @@ class ArrivalNode(ComponentNode):
 
     def _create_component_timer(self, port: Timer) -> None:
         handler = partial(self.guarded, port.name, port.handler(self.component))
-        self.create_timer(port.period, lambda: self._intake.enter(handler, self.host_time()), clock=self._steady)
+        now = self.host_time if port.stamping else self._steady_time
+        self.create_timer(port.period, lambda: self._intake.enter(handler, now()), clock=self._steady)
+
+    def _steady_time(self) -> int:
+        """Return simulation time once it is received; otherwise a monotonic time, which goes on where the system's clock is set [ns]."""
+        simulated = self.host_time() if cast(ROSClock, self.get_clock()).ros_time_is_active else 0
+        return simulated or time.monotonic_ns() + self._steady_offset
 
     def _warn_foreign_publishers(self) -> None:
         """Warn once of each foreign publisher on a topic that a neighbour publishes: its messages are ignored."""

@@ -18,6 +18,7 @@ from rclpy.subscription import Subscription
 
 MATCH_PERIOD = 1.0  # of the check of the publishers' reliability for raw inputs [s]
 TAKE_PERIOD = 0.02  # lazy inputs are read at least this often [s]
+TAKE_MAX = 200      # messages of one lazy input that are read at a time: a flood leaves time for other events
 SHARED_TOPICS = ("/tf", "/tf_static")  # topics with many publishers, inside this process and outside
 
 
@@ -80,10 +81,13 @@ class Intake:
                 self._node.destroy_subscription(subscription)
 
     def take_lazy(self) -> None:
-        """Process the messages of lazy inputs that wait in the middleware."""
+        """Process the messages of lazy inputs that wait in the middleware, up to `TAKE_MAX` of each."""
         for subscription, receive in self._lazy:
             with subscription.handle:
-                while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                for _ in range(TAKE_MAX):
+                    taken = subscription.handle.take_message(subscription.msg_type, True)
+                    if taken is None:
+                        break
                     receive(taken[0])
 
     @staticmethod

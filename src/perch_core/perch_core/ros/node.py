@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Any, NoReturn
 
 from perch_core.ros.component_node import ComponentNode  # first: it sets the threads of numpy  # isort: skip
@@ -21,6 +22,7 @@ from perch_core.ros.arrival import ArrivalNode
 from perch_core.ros.priority import priority
 from perch_core.ros.ros_init import init_ros
 from perch_core.ros.wiring import Wiring
+from perch_core.yaml_text import read_yaml
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor
 from rclpy.experimental import EventsExecutor
@@ -167,9 +169,11 @@ def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | N
     nodes: list[ComponentNode] = []
     stop = StopSignal()
     try:
-        _check_parameter_files(sys.argv if args is None else args)
+        arguments = sys.argv if args is None else args
+        _check_parameter_files(arguments)
         init_ros(args)
         nodes += create(Wiring())
+        _warn_unused_parameter_files(arguments, nodes)
         priority.nodes = len(nodes)
         executor = EventsExecutor()
         connect(nodes, executor)
@@ -195,9 +199,34 @@ def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | N
 
 def _check_parameter_files(arguments: Sequence[str]) -> None:
     """Raise ConfigError for a missing parameter file: rcl's own message includes a line of its C code."""
-    for option, file in zip(arguments, arguments[1:]):
-        if option == "--params-file" and not os.path.isfile(file):
-            raise ConfigError(option, file, "no such file")
+    for file in _parameter_files(arguments):
+        if not os.path.isfile(file):
+            raise ConfigError("--params-file", file, "no such file")
+
+
+def _warn_unused_parameter_files(arguments: Sequence[str], nodes: Sequence[Node]) -> None:
+    """Warn of each parameter file without a section for one of the nodes: rcl ignores it."""
+    names = [one.get_fully_qualified_name() for one in nodes]
+    for file in _parameter_files(arguments):
+        try:
+            sections = list(_sections(read_yaml(file)))
+        except ConfigError:  # rcl, which is less strict, has accepted it
+            continue
+        if not any(fnmatchcase(name, section.replace("/**", "*")) for name in names for section in sections):
+            nodes[0].get_logger().warning(f"{file}: not used: its sections are {', '.join(sections)}, none of which is {' or '.join(names)}")
+
+
+def _parameter_files(arguments: Sequence[str]) -> list[str]:
+    return [file for option, file in zip(arguments, arguments[1:]) if option == "--params-file"]
+
+
+def _sections(content: Any, name: str = "") -> Iterator[str]:
+    """Yield the fully qualified names, which may have wildcards, of the nodes for which a parameter file has values."""
+    for key, value in content.items() if isinstance(content, dict) else ():
+        if key == "ros__parameters":
+            yield name
+        else:
+            yield from _sections(value, f"{name}/{str(key).strip('/')}")
 
 
 def _refuse(problem: str) -> NoReturn:

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="DataclassInstance")
 
 _FOREIGN = ("use_sim_time", "start_type_description_service", "lockstep", "lockstep_hold")  # of ROS and of the host
-_QOS = "qos_overrides."  # of ROS, by topic
 
 
 def _leaves(cls: type[DataclassInstance], prefix: str = "") -> dict[str, tuple[Field[Any], Any]]:
@@ -95,7 +94,7 @@ class Parameters(typing.Generic[T]):
         self._leaves = _leaves(cls)
         overrides = {name: _plain(p.value) for name, p in node._parameter_overrides.items()}
         for name in overrides:
-            if name not in self._leaves and name not in _FOREIGN and not name.startswith(_QOS):
+            if name not in self._leaves and name not in _FOREIGN and not node.has_parameter(name):
                 raise config.unknown(node.get_name(), name, "parameter", self._leaves)
         self.value: T = config.from_mapping(
             cls, config.nested({n: v for n, v in overrides.items() if n in self._leaves}), node.get_name())

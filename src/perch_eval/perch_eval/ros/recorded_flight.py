@@ -15,8 +15,15 @@ from perch_eval.mcap_log import McapLog, read
 from perch_eval.ros.definitions import schema_of, type_name
 
 
+STREAMS = ("ground_truth/odometry", "imu/data_raw", "odometry")  # channels whose time never goes back within a flight
+RESTART = 1_000_000_000  # by which it goes back where time has restarted [ns]
+
+
 class RecordedFlight(Flight):
-    """The flight of an MCAP file, as the recorder or rosbag2 writes them. Only channels of `perch_core.ros.topics` are read."""
+    """The flight of an MCAP file, as the recorder or rosbag2 writes them. Only channels of `perch_core.ros.topics` are read.
+
+    Where time has restarted during the recording, `damage` says so, and the flight is what follows the last restart.
+    """
 
     def __init__(self, path: Path, namespace: str = "") -> None:
         """
@@ -27,12 +34,24 @@ class RecordedFlight(Flight):
         prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
         self._undecoded: dict[str, tuple[str, list[tuple[int, bytes]]]] = {}  # channel and messages that have not been requested
         damage: list[str] = []
+        restart = ""
+        last: dict[str, int] = {}    # time of the last message of each channel [ns]
+        restarted: set[str] = set()  # channels whose time has gone back at the last restart
         for topic, type_of, time, data in read(path, on_damage=damage.append):
             key = topic.removeprefix(prefix).lstrip("/")
             channel = _channel(key, type_of)
             if channel is not None and (topic.startswith(prefix) or channel.startswith("/")):
+                if time < last.get(key, time) - RESTART:
+                    if key in STREAMS and (key in restarted or not restarted):
+                        self._undecoded = {name: found for name, found in self._undecoded.items() if name == "robot_description"}
+                        last, restarted = {}, {key}
+                        restart = f"time has restarted: only what follows the last restart, at {1e-9 * time:.3f} s, is read"
+                    elif restarted and key not in restarted:  # messages of before that were written after the first one of another channel
+                        self._undecoded.pop(key, None)
+                        restarted.add(key)
+                last[key] = time
                 self._undecoded.setdefault(key, (channel, []))[1].append((time, data))
-        super().__init__({key: [] for key in self._undecoded}, str(path), damage[0] if damage else "")
+        super().__init__({key: [] for key in self._undecoded}, str(path), "; ".join(filter(None, [restart, *damage])))
 
     def values(self, channel: str) -> list[tuple[float, Any]]:
         """Return (time [s], value) of a channel in order; its messages are decoded at the first call."""

@@ -41,11 +41,11 @@ class Recorder(Listener[RecorderParameters]):
 
     config_type = RecorderParameters
 
-    flush = Timer(0.1)
+    flush = Timer(0.1, stamping=True)
 
     def __init__(self, config: RecorderParameters) -> None:
         super().__init__(config)
-        self._file = _unused(Path(config.file))
+        self._file = Path(config.file)
         self._log: McapLog | None = None
         self._last_image: dict[str, int] = {}
         self._messages, self._last_report = 0, -NANOSECONDS
@@ -54,6 +54,7 @@ class Recorder(Listener[RecorderParameters]):
     def warm_up(self) -> None:
         """Open the file; where there is one of an earlier recording, a new one beside it, as `flight.1.mcap`."""
         try:
+            self._file = _reserved(self._file)
             self._log = McapLog(self._file)
         except OSError as error:
             self._stop_recording(error)
@@ -83,10 +84,13 @@ class Recorder(Listener[RecorderParameters]):
                 self._log.flush()
             except OSError as error:
                 self._stop_recording(error)
-        if now - self._last_report >= NANOSECONDS:
-            self._last_report = now
-            level, message = (2, self._failure) if self._failure else (0, "ok")
-            self.diagnostics(Diagnostics(now, {"messages": self._messages}, level, message))
+        if abs(now - self._last_report) >= NANOSECONDS:
+            self._report(now)
+
+    def _report(self, now: int) -> None:
+        self._last_report = now
+        level, message = (2, self._failure) if self._failure else (0, "ok")
+        self.diagnostics(Diagnostics(now, {"messages": self._messages}, level, message))
 
     def close(self) -> None:
         """Finish the file."""
@@ -111,13 +115,25 @@ class Recorder(Listener[RecorderParameters]):
         if log is not None:
             log.abandon()
         self._failure = f"recording stopped: {self._file}: {error.strerror or error}"
+        self._report(self.host_time())
         self.log(LogLine("error", f"{self._failure}; the flight goes on, and what is written can be read"))
 
 
-def _unused(file: Path) -> Path:
-    """Return the file, or if it exists the first of `<name>.1.<suffix>`, `<name>.2.<suffix>`, ... that does not."""
-    candidates = (file.with_suffix(f".{k}{file.suffix}") for k in count(1))
-    return next(one for one in chain([file], candidates) if not one.is_file())
+def _reserved(file: Path) -> Path:
+    """Create the file, or if it exists the first of `<name>.1.<suffix>`, `<name>.2.<suffix>`, ... that does not, and return it.
+
+    Raises:
+        OSError: it cannot be created.
+    """
+    candidates = chain([file], (file.with_suffix(f".{k}{file.suffix}") for k in count(1)))
+    while True:
+        candidate = next(candidates)
+        try:
+            candidate.touch(exist_ok=False)
+        except FileExistsError:
+            if candidate.is_file():
+                continue
+        return candidate  # new, or a device
 
 
 def jpeg(image: CameraImage, quality: int) -> CompressedPixels | None:

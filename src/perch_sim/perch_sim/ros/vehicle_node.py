@@ -49,6 +49,7 @@ class VehicleNode(ComponentNode):
         self._schedule = Schedule(self.component, (), flight_tasks(self.component.scenario.latency), codec=topics)
         self._remote: dict[str, RemoteParticipant] = {}
         self._started = self._advance_queued = False
+        self._failure = ""  # exception in a step, after which the schedule cannot continue
         self._complete_checks = 0
         self._created_at = self._last_progress = self._last_warning = time.monotonic()
         self._dropped: set[str] = set()
@@ -126,7 +127,7 @@ class VehicleNode(ComponentNode):
 
     def _advance(self) -> None:
         """Advance the flight as far as the participants permit."""
-        if self._started and not self._advance_queued:
+        if self._started and not self._advance_queued and not self._failure:
             self.wiring.enter(self.guarded, "advance", self._burst)
 
     def _burst(self) -> None:
@@ -137,7 +138,12 @@ class VehicleNode(ComponentNode):
                 return
             if self._remote:
                 self._receive(0.0)
-            if schedule.advance():
+            try:
+                completed = schedule.advance()
+            except Exception as error:
+                self._failure = f"{type(error).__name__}: {error}"
+                raise RuntimeError("the simulation has failed in a step and does not continue") from error
+            if completed:
                 self._last_progress = time.monotonic()
                 if self._pending_images:
                     self._publish_rendered()
@@ -186,12 +192,14 @@ class VehicleNode(ComponentNode):
         if not self._started:
             self._receive(0.0)  # participants that end before the start
             self._check_start(now)
-        else:
+        elif not self._failure:
             self._check_silence(now)
         self._advance()
 
     def _describe_wait(self) -> str:
         """Describe what the flight waits for: participants, and the missing input of each."""
+        if self._failure:
+            return f"a new start, as the simulation has failed: {self._failure}"
         if not self._started:
             missing = self._missing()
             if missing:
