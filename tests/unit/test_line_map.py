@@ -2,10 +2,14 @@
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from oracles.wires import MOUNT, WIRE, cables, observe
 from perch_core import so3
+from perch_core.values import limits
 from perch_perception.line_mapping import (
     LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, WireEstimate, detect_lines, place)
 from perch_perception.line_mapping.association import meets_another
@@ -292,3 +296,39 @@ def test_the_chords_of_a_sagging_wire_stay_within_two_centimetres_of_it(sag):
         lines = mapper.update(body.time, body, [observe(rng, wire, p, time=body.time, radius=0.03)]).lines
     points = wire.at(np.linspace(-1.99, 1.99, 300))
     assert lines and np.max(np.min([line.segment.distance(points) for line in lines], axis=0)) < 0.021
+
+
+@settings(max_examples=25, deadline=None)
+@given(radius=st.just(0.0) | st.floats(0.001, 3.0), distance=st.floats(0.5, 40.0), seed=st.integers(0, 9))
+def test_whatever_is_seen_receivers_accept_the_map(radius, distance, seed):
+    """A line that they would refuse is left out, with the reason, and does not cost them the others."""
+    rng, mapper = np.random.default_rng(seed), LineMapper()
+    near, other = (WireCurve(np.array([x, 0.0, z]), np.array([0.0, 1.0, 0.0])) for x, z in ((3.0, 2.5), (distance, 4.0)))
+    for k in range(16):
+        centre = np.array([0.0, 0.0, 1.0 + 0.15 * k])
+        body = BodyState(0.1 * k, centre, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+        seen = [observe(rng, near, centre, 2e-4, time=body.time, radius=0.02),
+                observe(rng, other, centre, 2e-4, time=body.time, radius=min(radius, 0.9 * distance))]
+        result = mapper.update(body.time, body, seen)
+        assert limits.problem(result) == ""
+    assert len(result.lines) > 0
+
+
+def test_a_red_door_is_left_out_with_the_reason():
+    """4.4 x 2.6 m from 7 m, below a wire: as a wire its radius is 1.3 m, which every receiver refuses, with the whole map."""
+    camera, mapper = MOUNT.camera, LineMapper()
+    door, wire = (np.array([[x, y, z] for z, side in ((low, 1), (high, -1)) for y in side * np.linspace(-half, half, 30)])
+                  for x, half, low, high in ((7.0, 2.2, 0.6, 3.2), (3.0, 1.8, 3.4, 3.44)))
+    for k in range(40):
+        p = np.array([0.0, 0.3 * np.sin(k / 7), 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
+        p_WC, R_WC = MOUNT.pose(p, np.eye(3))
+        image = np.full((camera.height, camera.width, 3), 110, np.uint8)
+        for outline in (door, wire):
+            pixels = camera.project((outline - p_WC) @ R_WC)[0]
+            cv2.fillPoly(image, [np.rint(16.0 * pixels).astype(np.int32)], (180, 40, 40), cv2.LINE_AA, 4)
+        body = BodyState(0.1 * k, p, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+        seen = detect_lines(cv2.GaussianBlur(image, (0, 0), 0.8), camera, LineDetectionConfig())
+        result = mapper.update(body.time, body, [place(one, body, MOUNT) for one in seen])
+    assert limits.problem(result) == "" and not result.degenerate
+    assert len(result.lines) == 1 and result.lines[0].segment.distance(np.array([3.0, 0.0, 3.42])) < 0.15
+    assert result.message.startswith("line 1: radius: 1.3")

@@ -10,7 +10,7 @@ import numpy as np
 from perch_core import config, so3
 from perch_core.covariance import largest_sigma
 from perch_core.lines import Segment
-from perch_core.values import MappedPowerline, PowerlineMap, nanoseconds
+from perch_core.values import MappedPowerline, PowerlineMap, limits, nanoseconds
 from perch_perception.line_mapping.association import associate, meets_another
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.observation import LineObservation
@@ -120,7 +120,9 @@ class LineMapper:
                 missing.append(f"line {track.id}: {track.refusal}")
             else:
                 lines += self._segments(track, track.estimate, missing)
-        return PowerlineMap(nanoseconds(time), tuple(sorted(lines, key=lambda line: line.id)), bool(missing), "; ".join(missing))
+        refused = [f"line {line.id}: {reason}" for line in lines if (reason := limits.problem(line))]
+        lines = [line for line in lines if not limits.problem(line)]
+        return PowerlineMap(nanoseconds(time), tuple(sorted(lines, key=lambda line: line.id)), bool(missing), "; ".join(missing + refused))
 
     def _extend(self, track: _Track, one: LineObservation) -> bool:
         """Add a sighting; return False where it is from the same place as the last and is not kept."""
