@@ -197,7 +197,7 @@ def test_the_map_follows_an_odometry_that_drifts():
 def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it():
     """The odometry was corrected by more than sightings are associated over: one wire must not become two obstacles."""
     rng, mapper = np.random.default_rng(11), LineMapper(MapperConfig())
-    wire, jump = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), np.array([0.0, 0.0, -0.25])
+    wire, jump = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), np.array([0.0, 0.0, -0.15])
     for k in range(80):
         time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
         believed = true + (jump if k >= 30 else 0.0)
@@ -205,6 +205,24 @@ def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it():
         lines = mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time, believed=believed)]).lines
     assert len(lines) == 1
     assert np.linalg.norm((lines[0].segment.centre - [3.0, 0.0, 2.5] - jump)[[0, 2]]) < 0.03
+
+
+@pytest.mark.parametrize("jump", [(0.0, 0.0, -0.35), (0.35, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.3, 0.2)])
+def test_the_map_jumps_with_the_odometry(jump):
+    """In a hover: neither a ghost at the wire's old place nor a time without the wire, whether or not it is in view."""
+    rng, mapper = np.random.default_rng(11), LineMapper()
+    wires = [WireCurve(np.array([3.0, 0.0, z]), np.array([0.0, 1.0, 0.0])) for z in (2.5, 3.5)]
+    for k in range(80):
+        time, height = 0.1 * k, 1.6 + 0.8 * abs((k / 15) % 2 - 1)
+        true, speed = np.array([0.0, 0.0, height]), -0.53 if k % 30 < 15 else 0.53
+        believed = true + (np.array(jump) if k >= 40 else 0.0)
+        body = BodyState(time, believed, np.array([0, 0, 0, 1.0]), np.array([0.0, 0.0, speed]), np.zeros(3), np.eye(6) * 1e-6)
+        in_view = wires if k < 35 else wires[:1]
+        lines = mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time, believed=believed) for wire in in_view]).lines
+        if k > 30:
+            assert [line.id for line in lines] == [0, 1]
+            for line, wire in zip(lines, wires):
+                assert line.segment.distance(wire.point + believed - true) < 0.05
 
 
 def test_a_wire_out_of_view_stays_beside_its_neighbour_that_is_seen():

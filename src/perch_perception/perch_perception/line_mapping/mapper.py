@@ -28,6 +28,7 @@ STRAIGHTNESS = 0.02  # a sagging wire is cut into chords that stay within this [
 PIECE_IDS = 1_000_000  # ids of the pieces of wire k: k, k + 1,000,000, ...
 ATTACHED_COUNT = 3    # surplus of images that show a line attached to the surface beside it: it is no wire
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
+JUMP, JUMP_WITHIN = 0.15, 0.3  # odometry that moves by so much more than its velocity explains, within so long, has jumped [m, s]
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,8 @@ class _Track:
 class LineMapper:
     """Tracks, triangulates and stores wires. The state is the list of wires.
 
-    Wires are stored in a frame without the odometry's position corrections: these move neither the vehicle nor the wire relative
-    to the vehicle. The map is published in the odometry's present W.
+    Wires are stored in a frame without the odometry's position corrections and jumps: these move neither the vehicle nor the wire
+    relative to the vehicle. The map is published in the odometry's present W.
     """
 
     def __init__(self, settings: MapperConfig | None = None) -> None:
@@ -62,7 +63,8 @@ class LineMapper:
         self._tracks: list[_Track] = []
         self._next_id = 0
         self._body: BodyState | None = None
-        self._corrected = np.zeros(3)
+        self._jumped = np.zeros(3)  # sum of the odometry's jumps [m]
+        self._corrected = np.zeros(3)  # and of its corrections [m]
 
     def update(self, time: float, body: BodyState, seen: Sequence[LineObservation],
                attached: Callable[[LineObservation, WireCurve], bool | None] | None = None) -> PowerlineMap:
@@ -75,9 +77,11 @@ class LineMapper:
             attached: returns whether a sighting of a wire (both without the odometry's corrections) lies on the surface beside
                 it; None: undecided.
         """
-        self._corrected = body.corrected
-        self._body = replace(body, p_WB=body.p_WB - body.corrected)
-        seen = [replace(one, p_WC=one.p_WC - body.corrected) for one in seen]
+        if self._body is not None:
+            self._jumped = self._jumped + _jump(self._body, replace(body, p_WB=body.p_WB - body.corrected - self._jumped))
+        self._corrected = body.corrected + self._jumped
+        self._body = replace(body, p_WB=body.p_WB - self._corrected)
+        seen = [replace(one, p_WC=one.p_WC - self._corrected) for one in seen]
         changed = set()
         owners = associate(self._tracks, seen)
         for one, owner in zip(seen, owners):
@@ -228,6 +232,13 @@ class LineMapper:
         assert self._body is not None
         attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1]
         return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + attitude))
+
+
+def _jump(before: BodyState, body: BodyState) -> np.ndarray:
+    """Return the motion from one image to the next that the velocity does not explain, (3,) [m]; 0 where it is no jump."""
+    dt = body.time - before.time
+    unexplained = body.p_WB - before.p_WB - 0.5 * dt * (before.v_WB + body.v_WB)
+    return unexplained if dt < JUMP_WITHIN and np.linalg.norm(unexplained) > JUMP else np.zeros(3)
 
 
 def _chord(curve: WireCurve, a: float, b: float, radius: float, offset: np.ndarray) -> Segment:
