@@ -1,5 +1,6 @@
 """The map of wires: from rendered images, its ids and extents, and what changes it."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -12,6 +13,7 @@ from perch_core import so3
 from perch_core.values import limits
 from perch_perception.line_mapping import (
     LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, WireEstimate, detect_lines, place)
+from perch_perception.line_mapping import mapper as mapper_module
 from perch_perception.line_mapping.association import meets_another
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.powerline_mapper import mapping_pose
@@ -248,7 +250,7 @@ def test_two_that_turn_out_to_be_one_were_last_seen_when_either_was():
         maps.append(mapper)
     older, newer = maps
     older._tracks += newer._tracks
-    older._merge()
+    older._merge(set(older._tracks))
     assert [track.last.time for track in older._tracks] == [newer._tracks[0].last.time]
 
 
@@ -350,3 +352,43 @@ def test_a_red_door_is_left_out_with_the_reason():
     assert limits.problem(result) == "" and not result.degenerate
     assert len(result.lines) == 1 and result.lines[0].segment.distance(np.array([3.0, 0.0, 3.42])) < 0.15
     assert result.message.startswith("line 1: radius: 1.3")
+
+
+def test_wires_that_were_passed_cost_little_and_are_not_missed(monkeypatch):
+    """300 wires, four of them in view: these are compared with the others, not all with all, and the far ones are forgotten."""
+    rng, mapper, compared = np.random.default_rng(1), LineMapper(), []
+    wires = [WireCurve(np.array([3.0 + 0.5 * i, 0.0, 2.5 + 0.6 * i]), np.array([0.0, 1.0, 0.0])) for i in range(4)]
+
+    def image(k):
+        centre = np.array([0.0, 0.0, 1.6 + 0.1 * k])
+        body = BodyState(0.1 * k, centre, np.array([0, 0, 0, 1.0]), np.array([0.0, 0.0, 1.0]), np.zeros(3), np.eye(6) * 1e-4)
+        return mapper.update(body.time, body, [observe(rng, wire, centre, 2e-4, time=body.time) for wire in wires])
+
+    for k in range(8):
+        image(k)
+    known = mapper._tracks[0]
+    for k in range(296):
+        away = np.array([-8.0 - 2.0 * k, 0.0, 0.0])
+        last = replace(known.last, time=-10.0, p_WC=known.last.p_WC + away)
+        estimate = replace(known.estimate, curve=replace(known.estimate.curve, point=known.estimate.curve.point + away))
+        mapper._tracks.append(mapper_module._Track(100 + k, [last], last, 8, estimate, known.extent))
+    monkeypatch.setattr(mapper_module, "_is_adjacent", lambda a, b, distance, original=mapper_module._is_adjacent:
+                        compared.append((a, b)) or original(a, b, distance))
+    result = image(8)
+    assert len(compared) <= 2 * 4 * 300, "to merge and to supersede"
+    assert len(mapper._tracks) == 4 + 23, "23 are within 50 m"
+    assert not result.degenerate and [line.id for line in result.lines[:4]] == [0, 1, 2, 3]
+
+
+def test_more_lines_than_receivers_accept_are_not_published():
+    mapper = LineMapper()
+    body = BodyState(0.0, np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+    mapper.update(0.0, body, [])
+    along = np.array([0.0, 1.0, 0.0])
+    for k in range(510):
+        one = observe(np.random.default_rng(0), WireCurve(np.array([3.0 + 0.05 * k, 0.0, 2.0]), along), np.zeros(3))
+        estimate = WireEstimate(WireCurve(np.array([3.0 + 0.05 * k, 0.0, 2.0]), along), 1e-6 * np.eye(5), np.ones(4, bool), np.zeros(3), 0.01)
+        mapper._tracks.append(mapper_module._Track(k, [one], one, 9, estimate, (-2.0, 2.0)))
+    result = mapper.map(0.1)
+    assert limits.problem(result) == "" and [line.id for line in result.lines] == list(range(500))
+    assert "nearest 500" in result.message

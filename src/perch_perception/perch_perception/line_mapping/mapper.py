@@ -28,6 +28,8 @@ STRAIGHTNESS = 0.02  # a sagging wire is cut into chords that stay within this [
 PIECE_IDS = 1_000_000  # ids of the pieces of wire k: k, k + 1,000,000, ...
 ATTACHED_COUNT = 3    # surplus of images that show a line attached to the surface beside it: it is no wire
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
+MAX_LINES = limits.LIMITS[PowerlineMap]["lines"].count_max  # that receivers accept
+FORGET_BEYOND = 50.0  # a triangulated wire out of view that is further away from the vehicle is dropped [m]
 JUMP, JUMP_WITHIN = 0.15, 0.3  # odometry that moves by so much more than its velocity explains, within so long, has jumped [m, s]
 
 
@@ -39,7 +41,7 @@ class MapperConfig:
     triangulation: TriangulationConfig = config.part(TriangulationConfig)
 
 
-@dataclass
+@dataclass(eq=False)
 class _Track:
     id: int
     observations: list[LineObservation]
@@ -82,7 +84,7 @@ class LineMapper:
         self._corrected = body.corrected + self._jumped
         self._body = replace(body, p_WB=body.p_WB - self._corrected)
         seen = [replace(one, p_WC=one.p_WC - self._corrected) for one in seen]
-        changed = set()
+        changed: set[int] = set()
         owners = associate(self._tracks, seen)
         for one, owner in zip(seen, owners):
             if owner is None:
@@ -96,10 +98,10 @@ class LineMapper:
             self._triangulate(self._tracks[index])
         if attached is not None:
             self._count_attached(seen, owners, attached)
-        self._merge()
+        self._merge({self._tracks[index] for index in changed})
         self._supersede(time)
-        self._tracks = [t for t in self._tracks
-                        if (t.estimate is not None and t.attached < ATTACHED_COUNT) or time - t.last.time <= FORGET_AFTER]
+        self._tracks = [t for t in self._tracks if time - t.last.time <= FORGET_AFTER
+                        or t.estimate is not None and t.attached < ATTACHED_COUNT and _distance(t, self._body.p_WB) < FORGET_BEYOND]
         return self.map(time)
 
     def _count_attached(self, seen: Sequence[LineObservation], owners: Sequence[int | None],
@@ -120,12 +122,16 @@ class LineMapper:
         for track in self._tracks:
             if track.count < MIN_OBSERVATIONS or track.attached >= ATTACHED_COUNT:
                 continue
-            if track.estimate is None:
-                missing.append(f"line {track.id}: {track.refusal}")
-            else:
-                lines += self._segments(track, track.estimate, missing)
+            segments, reason = self._segments(track)
+            lines += segments
+            if reason is not None and time - track.last.time <= FORGET_AFTER:  # what is out of view may never be known better
+                missing.append(f"line {track.id}: {reason}")
         refused = [f"line {line.id}: {reason}" for line in lines if (reason := limits.problem(line))]
         lines = [line for line in lines if not limits.problem(line)]
+        if len(lines) > MAX_LINES and self._body is not None:
+            p_WB = self._body.p_WB + self._corrected
+            lines = sorted(lines, key=lambda line: float(line.segment.distance(p_WB)))[:MAX_LINES]
+            refused.append(f"only the nearest {MAX_LINES} lines are published")
         return PowerlineMap(nanoseconds(time), tuple(sorted(lines, key=lambda line: line.id)), bool(missing), "; ".join(missing + refused))
 
     def _extend(self, track: _Track, one: LineObservation) -> bool:
@@ -168,13 +174,15 @@ class LineMapper:
         low, high = float(np.sort(ends[:, 0])[1]), float(np.sort(ends[:, 1])[-2])
         return (low, high) if high - low > 0.1 else None
 
-    def _merge(self) -> None:
-        """Merge wires that turned out to be the same; the older one keeps its id."""
+    def _merge(self, changed: set[_Track]) -> None:
+        """Merge wires that turned out to be the same, now that some have changed; the older one keeps its id."""
         kept: list[_Track] = []
+        kept_changed: list[_Track] = []
         for track in self._tracks:
-            twin = next((other for other in kept if _same_wire(other, track)), None)
+            twin = next((other for other in (kept if track in changed else kept_changed) if _same_wire(other, track)), None)
             if twin is None:
                 kept.append(track)
+                kept_changed += [track] if track in changed else []
                 continue
             merged = sorted(twin.observations + track.observations, key=lambda one: one.time)
             while len(merged) > MAX_OBSERVATIONS:
@@ -182,6 +190,7 @@ class LineMapper:
             twin.observations, twin.count, twin.attached = merged, twin.count + track.count, twin.attached + track.attached
             twin.last = max(twin.last, track.last, key=lambda one: one.time)
             self._triangulate(twin)
+            kept_changed.append(twin)
         self._tracks = kept
 
     def _supersede(self, time: float) -> None:
@@ -194,11 +203,13 @@ class LineMapper:
         self._tracks = [t for t in self._tracks if time - t.last.time <= STALE_AFTER
                         or not any(other.observations[0].time > t.last.time and _is_adjacent(t, other, SUPERSEDED) for other in fresh)]
 
-    def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedPowerline]:
-        """Return the wire as chords that stay within `STRAIGHTNESS`; none, with the reason in `missing`, if too uncertain."""
+    def _segments(self, track: _Track) -> tuple[list[MappedPowerline], str | None]:
+        """Return the wire as chords that stay within `STRAIGHTNESS`, or none and the reason."""
+        estimate = track.estimate
+        if estimate is None:
+            return [], track.refusal
         if track.extent is None:
-            missing.append(f"line {track.id}: its ends were not seen yet")
-            return []
+            return [], "its ends were not seen yet"
         low, high = track.extent
         length = high - low
         sag = abs(estimate.curve.curvature) * length**2 / 8.0
@@ -211,12 +222,11 @@ class LineMapper:
             covariance = self._covariance(estimate, 0.5 * (a + b))
             sigma = largest_sigma(covariance)
             if sigma > self.settings.max_sigma:
-                missing.append(f"line {track.id}: position uncertainty of {sigma:.2f} m is too large")
-                return []
+                return [], f"position uncertainty of {sigma:.2f} m is too large"
             start, end = _chord(estimate.curve, a, b, radius, self._corrected).ends
             lines.append(MappedPowerline(track.id + PIECE_IDS * k, tuple(start.tolist()), tuple(end.tolist()), radius, covariance,
                                          self._direction_sigma(estimate), track.count))
-        return lines
+        return lines, None
 
     def _covariance(self, estimate: WireEstimate, s: float) -> np.ndarray:
         """Return the covariance of the point at s relative to the vehicle, from sightings and attitude, shape (3, 3) [m^2].
@@ -239,6 +249,13 @@ def _jump(before: BodyState, body: BodyState) -> np.ndarray:
     dt = body.time - before.time
     unexplained = body.p_WB - before.p_WB - 0.5 * dt * (before.v_WB + body.v_WB)
     return unexplained if dt < JUMP_WITHIN and np.linalg.norm(unexplained) > JUMP else np.zeros(3)
+
+
+def _distance(track: _Track, p_WB: np.ndarray) -> float:
+    """Distance of the vehicle from the seen part of a triangulated wire [m]."""
+    assert track.estimate is not None
+    curve, (low, high) = track.estimate.curve, track.extent or (0.0, 0.0)
+    return float(np.linalg.norm(curve.at(np.clip((p_WB - curve.point) @ curve.direction, low, high)) - p_WB))
 
 
 def _chord(curve: WireCurve, a: float, b: float, radius: float, offset: np.ndarray) -> Segment:
