@@ -126,8 +126,9 @@ class LineMapper:
             lines += segments
             if reason is not None and time - track.last.time <= FORGET_AFTER:  # what is out of view may never be known better
                 missing.append(f"line {track.id}: {reason}")
-        refused = [f"line {line.id}: {reason}" for line in lines if (reason := limits.problem(line))]
-        lines = [line for line in lines if not limits.problem(line)]
+        checked = [(line, limits.problem(line)) for line in lines]
+        lines = [line for line, problem in checked if not problem]
+        refused = [f"line {line.id}: {problem}" for line, problem in checked if problem]
         if len(lines) > MAX_LINES and self._body is not None:
             p_WB = self._body.p_WB + self._corrected
             lines = sorted(lines, key=lambda line: float(line.segment.distance(p_WB)))[:MAX_LINES]
