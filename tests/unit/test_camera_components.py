@@ -131,6 +131,15 @@ def test_the_queue_is_bounded():
     assert len(bench.exposures) == MAX_QUEUED and bench.exposures[0] == 150 + EXPOSED // MS
 
 
+def test_odometry_that_never_comes_is_named():
+    for component in (Bench().component, mapper()[0]):
+        out = Outputs(component)
+        for k in range(MAX_QUEUED + 1):
+            assert out.warnings() == []
+            component.on_image(picture(k * 100 * MS, encoding="rgb8"))
+        assert len(out.warnings()) == 1 and "no odometry yet" in out.warnings()[0]
+
+
 @pytest.mark.parametrize("bad", [
     dict(p_WB=(math.nan, 0.0, 0.0)), dict(q_WB=(0.0, 0.0, 0.0, 0.0)), dict(frame="camera"), dict(pose_covariance=np.eye(6) * 1e300),
     dict(pose_covariance=-np.eye(6)), dict(pose_covariance=np.full((6, 6), np.nan)), dict(pose_covariance=np.eye(3)),

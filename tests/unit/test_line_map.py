@@ -193,7 +193,7 @@ def test_the_map_follows_an_odometry_that_drifts():
 def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it():
     """The odometry was corrected by more than sightings are associated over: one wire must not become two obstacles."""
     rng, mapper = np.random.default_rng(11), LineMapper(MapperConfig())
-    wire, jump = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), np.array([0.0, 0.0, -0.25])
+    wire, jump = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), np.array([0.0, 0.0, -0.15])
     for k in range(80):
         time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
         believed = true + (jump if k >= 30 else 0.0)
@@ -226,7 +226,7 @@ def test_two_that_turn_out_to_be_one_were_last_seen_when_either_was():
         maps.append(mapper)
     older, newer = maps
     older._tracks += newer._tracks
-    older._merge()
+    older._merge(set(older._tracks))
     assert [track.last.time for track in older._tracks] == [newer._tracks[0].last.time]
 
 

@@ -93,6 +93,11 @@ class CameraComponent(Component[C], ABC):
         """Return the reason why this component cannot use a camera; empty where it can."""
         return ""
 
+    @property
+    def missing(self) -> str:
+        """Description of what all images wait for; empty once it has come."""
+        return self.mounted.missing
+
     @abstractmethod
     def use_camera(self, mount: CameraMount) -> None:
         """Called when the camera has become known or has changed."""
@@ -128,7 +133,8 @@ class CameraComponent(Component[C], ABC):
         if len(self._queue) > MAX_QUEUED:
             self._queue.popleft()
             self.dropped += 1
-            self.warn(f"{self._topic}: more than {MAX_QUEUED} images are waiting: the oldest are dropped", 1.0)
+            reason = f" ({self.missing})" if self.missing else ""
+            self.warn(f"{self._topic}: more than {MAX_QUEUED} images are waiting{reason}: the oldest are dropped", 1.0)
         if self.mounted.missing:
             self.warn(f"{self._topic}: images are not used: {self.mounted.missing}", 1.0)
         self.advance()
@@ -176,6 +182,11 @@ class PosedCameraComponent(CameraComponent[C]):
     def refuse(self, image: CameraImage, exposure_time: float, reason: str) -> None:
         """Report that an image cannot be used."""
         self.warn(f"{self._topic}: {reason}", 1.0)
+
+    @property
+    def missing(self) -> str:
+        """Description of what all images wait for: the camera, or the first odometry."""
+        return super().missing or ("" if len(self.bodies) else f"no {self._channel('odometry')} yet")
 
     def restart(self) -> None:
         """Discard all states and images after a restart of the odometry."""

@@ -10,7 +10,7 @@ import numpy as np
 from perch_core import config, so3
 from perch_core.covariance import largest_sigma
 from perch_core.lines import Segment
-from perch_core.values import MappedPowerline, PowerlineMap, nanoseconds
+from perch_core.values import MappedPowerline, PowerlineMap, limits, nanoseconds
 from perch_perception.line_mapping.association import associate, meets_another
 from perch_perception.line_mapping.curve import WireCurve
 from perch_perception.line_mapping.observation import LineObservation
@@ -28,6 +28,9 @@ STRAIGHTNESS = 0.02  # a sagging wire is cut into chords that stay within this [
 PIECE_IDS = 1_000_000  # ids of the pieces of wire k: k, k + 1,000,000, ...
 ATTACHED_COUNT = 3    # surplus of images that show a line attached to the surface beside it: it is no wire
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
+MAX_LINES = limits.LIMITS[PowerlineMap]["lines"].count_max  # that receivers accept
+FORGET_BEYOND = 50.0  # a triangulated wire out of view that is further away from the vehicle is dropped [m]
+JUMP, JUMP_WITHIN = 0.15, 0.3  # odometry that moves by so much more than its velocity explains, within so long, has jumped [m, s]
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class MapperConfig:
     triangulation: TriangulationConfig = config.part(TriangulationConfig)
 
 
-@dataclass
+@dataclass(eq=False)
 class _Track:
     id: int
     observations: list[LineObservation]
@@ -53,8 +56,8 @@ class _Track:
 class LineMapper:
     """Tracks, triangulates and stores wires. The state is the list of wires.
 
-    Wires are stored in a frame without the odometry's position corrections: these move neither the vehicle nor the wire relative
-    to the vehicle. The map is published in the odometry's present W.
+    Wires are stored in a frame without the odometry's position corrections and jumps: these move neither the vehicle nor the wire
+    relative to the vehicle. The map is published in the odometry's present W.
     """
 
     def __init__(self, settings: MapperConfig | None = None) -> None:
@@ -62,7 +65,8 @@ class LineMapper:
         self._tracks: list[_Track] = []
         self._next_id = 0
         self._body: BodyState | None = None
-        self._corrected = np.zeros(3)
+        self._jumped = np.zeros(3)  # sum of the odometry's jumps [m]
+        self._corrected = np.zeros(3)  # and of its corrections [m]
 
     def update(self, time: float, body: BodyState, seen: Sequence[LineObservation],
                attached: Callable[[LineObservation, WireCurve], bool | None] | None = None) -> PowerlineMap:
@@ -75,10 +79,12 @@ class LineMapper:
             attached: returns whether a sighting of a wire (both without the odometry's corrections) lies on the surface beside
                 it; None: undecided.
         """
-        self._corrected = body.corrected
-        self._body = replace(body, p_WB=body.p_WB - body.corrected)
-        seen = [replace(one, p_WC=one.p_WC - body.corrected) for one in seen]
-        changed = set()
+        if self._body is not None:
+            self._jumped = self._jumped + _jump(self._body, replace(body, p_WB=body.p_WB - body.corrected - self._jumped))
+        self._corrected = body.corrected + self._jumped
+        self._body = replace(body, p_WB=body.p_WB - self._corrected)
+        seen = [replace(one, p_WC=one.p_WC - self._corrected) for one in seen]
+        changed: set[int] = set()
         owners = associate(self._tracks, seen)
         for one, owner in zip(seen, owners):
             if owner is None:
@@ -92,10 +98,10 @@ class LineMapper:
             self._triangulate(self._tracks[index])
         if attached is not None:
             self._count_attached(seen, owners, attached)
-        self._merge()
+        self._merge({self._tracks[index] for index in changed})
         self._supersede(time)
-        self._tracks = [t for t in self._tracks
-                        if (t.estimate is not None and t.attached < ATTACHED_COUNT) or time - t.last.time <= FORGET_AFTER]
+        self._tracks = [t for t in self._tracks if time - t.last.time <= FORGET_AFTER
+                        or t.estimate is not None and t.attached < ATTACHED_COUNT and _distance(t, self._body.p_WB) < FORGET_BEYOND]
         return self.map(time)
 
     def _count_attached(self, seen: Sequence[LineObservation], owners: Sequence[int | None],
@@ -116,11 +122,18 @@ class LineMapper:
         for track in self._tracks:
             if track.count < MIN_OBSERVATIONS or track.attached >= ATTACHED_COUNT:
                 continue
-            if track.estimate is None:
-                missing.append(f"line {track.id}: {track.refusal}")
-            else:
-                lines += self._segments(track, track.estimate, missing)
-        return PowerlineMap(nanoseconds(time), tuple(sorted(lines, key=lambda line: line.id)), bool(missing), "; ".join(missing))
+            segments, reason = self._segments(track)
+            lines += segments
+            if reason is not None and time - track.last.time <= FORGET_AFTER:  # what is out of view may never be known better
+                missing.append(f"line {track.id}: {reason}")
+        checked = [(line, limits.problem(line)) for line in lines]
+        lines = [line for line, problem in checked if not problem]
+        refused = [f"line {line.id}: {problem}" for line, problem in checked if problem]
+        if len(lines) > MAX_LINES and self._body is not None:
+            p_WB = self._body.p_WB + self._corrected
+            lines = sorted(lines, key=lambda line: float(line.segment.distance(p_WB)))[:MAX_LINES]
+            refused.append(f"only the nearest {MAX_LINES} lines are published")
+        return PowerlineMap(nanoseconds(time), tuple(sorted(lines, key=lambda line: line.id)), bool(missing), "; ".join(missing + refused))
 
     def _extend(self, track: _Track, one: LineObservation) -> bool:
         """Add a sighting; return False where it is from the same place as the last and is not kept."""
@@ -162,13 +175,15 @@ class LineMapper:
         low, high = float(np.sort(ends[:, 0])[1]), float(np.sort(ends[:, 1])[-2])
         return (low, high) if high - low > 0.1 else None
 
-    def _merge(self) -> None:
-        """Merge wires that turned out to be the same; the older one keeps its id."""
+    def _merge(self, changed: set[_Track]) -> None:
+        """Merge wires that turned out to be the same, now that some have changed; the older one keeps its id."""
         kept: list[_Track] = []
+        kept_changed: list[_Track] = []
         for track in self._tracks:
-            twin = next((other for other in kept if _same_wire(other, track)), None)
+            twin = next((other for other in (kept if track in changed else kept_changed) if _same_wire(other, track)), None)
             if twin is None:
                 kept.append(track)
+                kept_changed += [track] if track in changed else []
                 continue
             merged = sorted(twin.observations + track.observations, key=lambda one: one.time)
             while len(merged) > MAX_OBSERVATIONS:
@@ -176,6 +191,7 @@ class LineMapper:
             twin.observations, twin.count, twin.attached = merged, twin.count + track.count, twin.attached + track.attached
             twin.last = max(twin.last, track.last, key=lambda one: one.time)
             self._triangulate(twin)
+            kept_changed.append(twin)
         self._tracks = kept
 
     def _supersede(self, time: float) -> None:
@@ -188,11 +204,13 @@ class LineMapper:
         self._tracks = [t for t in self._tracks if time - t.last.time <= STALE_AFTER
                         or not any(other.observations[0].time > t.last.time and _is_adjacent(t, other, SUPERSEDED) for other in fresh)]
 
-    def _segments(self, track: _Track, estimate: WireEstimate, missing: list[str]) -> list[MappedPowerline]:
-        """Return the wire as chords that stay within `STRAIGHTNESS`; none, with the reason in `missing`, if too uncertain."""
+    def _segments(self, track: _Track) -> tuple[list[MappedPowerline], str | None]:
+        """Return the wire as chords that stay within `STRAIGHTNESS`, or none and the reason."""
+        estimate = track.estimate
+        if estimate is None:
+            return [], track.refusal
         if track.extent is None:
-            missing.append(f"line {track.id}: its ends were not seen yet")
-            return []
+            return [], "its ends were not seen yet"
         low, high = track.extent
         length = high - low
         sag = abs(estimate.curve.curvature) * length**2 / 8.0
@@ -205,12 +223,11 @@ class LineMapper:
             covariance = self._covariance(estimate, 0.5 * (a + b))
             sigma = largest_sigma(covariance)
             if sigma > self.settings.max_sigma:
-                missing.append(f"line {track.id}: position uncertainty of {sigma:.2f} m is too large")
-                return []
+                return [], f"position uncertainty of {sigma:.2f} m is too large"
             start, end = _chord(estimate.curve, a, b, radius, self._corrected).ends
             lines.append(MappedPowerline(track.id + PIECE_IDS * k, tuple(start.tolist()), tuple(end.tolist()), radius, covariance,
                                          self._direction_sigma(estimate), track.count))
-        return lines
+        return lines, None
 
     def _covariance(self, estimate: WireEstimate, s: float) -> np.ndarray:
         """Return the covariance of the point at s relative to the vehicle, from sightings and attitude, shape (3, 3) [m^2].
@@ -226,6 +243,20 @@ class LineMapper:
         assert self._body is not None
         attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1]
         return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + attitude))
+
+
+def _jump(before: BodyState, body: BodyState) -> np.ndarray:
+    """Return the motion from one image to the next that the velocity does not explain, (3,) [m]; 0 where it is no jump."""
+    dt = body.time - before.time
+    unexplained = body.p_WB - before.p_WB - 0.5 * dt * (before.v_WB + body.v_WB)
+    return unexplained if dt < JUMP_WITHIN and np.linalg.norm(unexplained) > JUMP else np.zeros(3)
+
+
+def _distance(track: _Track, p_WB: np.ndarray) -> float:
+    """Distance of the vehicle from the seen part of a triangulated wire [m]."""
+    assert track.estimate is not None
+    curve, (low, high) = track.estimate.curve, track.extent or (0.0, 0.0)
+    return float(np.linalg.norm(curve.at(np.clip((p_WB - curve.point) @ curve.direction, low, high)) - p_WB))
 
 
 def _chord(curve: WireCurve, a: float, b: float, radius: float, offset: np.ndarray) -> Segment:
