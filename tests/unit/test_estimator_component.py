@@ -169,10 +169,32 @@ def test_samples_with_stamps_that_go_back_or_far_ahead_give_nothing():
     hover.fly(0.5).assert_running()
 
 
-@pytest.mark.parametrize("jump", [-900 * MS, 3600 * 10**9])
+@pytest.mark.parametrize("step", [22, 30, 100])
+def test_a_clock_that_is_set_back_a_little_is_waited_for(step):
+    hover = Hover().fly(1.0)
+    hover.now -= step * MS
+    count, hover.next_vio = len(hover.out["odometry"]), hover.now + 20 * MS
+    hover.fly(0.001 * step)
+    assert len(hover.out["odometry"]) <= count + 1  # they never go back
+    hover.fly(0.5).assert_running()
+    assert hover.last.stamp == hover.now and not any("restarting" in text for text in hover.out.warnings())
+
+
+@pytest.mark.parametrize("number", [10, 50])
+def test_samples_that_are_delivered_again_give_nothing(number):
+    hover = Hover().fly(1.0)
+    count = len(hover.out["odometry"])
+    for k in range(number):
+        hover.estimator.on_imu(hover.sample(stamp=hover.now - (number + 5 - k) * hover.period))
+    assert len(hover.out["odometry"]) == count
+    hover.fly(0.5).assert_running()
+    assert not any("restarting" in text for text in hover.out.warnings())
+
+
+@pytest.mark.parametrize("jump", [-1100 * MS, 3600 * 10**9])
 def test_a_source_that_was_started_again_is_heard_again(jump):
     """Its stamps go on from elsewhere: the filter begins anew, with VIO's next measurement."""
-    hover = Hover().fly(1.0)
+    hover = Hover().fly(1.5)
     hover.now += jump
     hover.next_vio = hover.now + 100 * MS
     hover.fly(0.5)
