@@ -140,6 +140,30 @@ def test_bad_measurements_are_dropped_with_a_warning_and_the_next_good_one_count
     hover.fly(0.2).assert_running()
 
 
+BODY, WORLD, ZERO = (lambda v, R: R.T @ v), (lambda v, R: v), (lambda v, R: np.zeros(3))
+
+
+@pytest.mark.parametrize(("twist", "sigma", "jump", "warned"), [
+    (BODY, 0.01, 0.0, False), (BODY, 0.01, 5.0, False), (WORLD, 0.1, 0.0, True), (WORLD, 0.01, 0.0, True), (ZERO, 0.01, 0.0, True), (ZERO, 0.0, 0.0, False)])
+@pytest.mark.parametrize("period", [10, 34])
+def test_a_twist_of_another_frame_is_named_and_not_used(twist, sigma, jump, warned, period):
+    """Odometry of a curved flight with a yaw of 90 deg; a jump of the poses with a right twist changes no velocity."""
+    estimator, rng, q, errors = StateEstimator(UkfConfig()), np.random.default_rng(0), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)), []
+    out, R = Outputs(estimator), so3.quat_to_matrix(np.array(q))
+    for k in range(1500):
+        t = 0.002 * k
+        v, a = np.array([1.5, 1.5 * math.sin(2.0 * t), 0.0]), np.array([0.0, 3.0 * math.cos(2.0 * t), 9.81])
+        p = np.array([1.5 * t + (jump if t > 2.0 else 0.0), -0.75 * math.cos(2.0 * t), 1.0])
+        estimator.on_imu(ImuSample(2 * k * MS, tuple(rng.normal(0.0, 0.02, 3)), tuple(R.T @ a + rng.normal(0.0, 0.3, 3))))
+        if 2 * k % period == 0:
+            estimator.on_vio_odometry(odometry(2 * k * MS, tuple(p), q, v_B=tuple(twist(v, R)), twist_covariance=np.eye(6) * sigma**2))
+        if out["odometry"]:
+            last = out["odometry"][-1]
+            errors.append(np.linalg.norm(R @ last.v_B - v) if t > 1.2 else 0.0)
+    assert max(errors) < 0.1 and np.linalg.norm(last.p_WB - p) < 0.1 and out["status"][-1].state == 1
+    assert any("twist" in text and "base_link" in text for text in out.warnings()) is warned
+
+
 @pytest.mark.parametrize("shift", [-5_000 * MS, 5_000 * MS, 10**17])
 def test_measurements_of_another_time_are_refused(shift):
     hover = Hover().fly(1.0)
