@@ -173,6 +173,21 @@ def test_a_clock_that_is_set_back_a_little_and_samples_delivered_again_discard_n
     assert flight.error(last, -1_000_000 * step)[0] < 0.08
 
 
+def test_an_image_that_is_repeated_in_flight_is_no_rest():
+    """The camera freezes in the climb: no pose from then on, and poses again with the images."""
+    flight, held = Flight().fly(2.0), []
+
+    def freeze(image):
+        held.append(image.pixels())
+        return CameraImage(image.stamp, FRAME, 640, 480, "mono8", held[0])
+
+    flight.fly(3.2, tamper=freeze)
+    assert flight.component.result.outcome.name == "REPEATED" and flight.out["state"][-1].stamp < 2.1e9
+    flight.fly()
+    last = flight.out["state"][-1]
+    assert flight.component.result.outcome.name == "TRACKING" and flight.error(last)[0] < 3.0 * math.sqrt(np.trace(last.covariance[:3, :3]))
+
+
 def test_bad_samples_are_dropped_with_a_warning():
     flight = Flight().fly(1.0)
     last = flight.samples[0].stamp

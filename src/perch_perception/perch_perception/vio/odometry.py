@@ -76,6 +76,7 @@ class VisualInertialOdometry:
         self._last_visual_update: int | None = None  # when vision last changed the state; None: not since the last rest
         self._frame = 0
         self._last_image = -1  # stamp of the last frame used, on the board's clock
+        self._last_pixels = np.zeros(1, np.uint8)  # some of the last image's
         self._last_exposure: int | None = None
         self._last_update = 0  # when vision or rest last updated the filter
         self._observation_counts: deque[tuple[int, int]] = deque(maxlen=_DIVERGENCE_FRAMES)  # observations used and refused
@@ -170,6 +171,10 @@ class VisualInertialOdometry:
             return FrameOutcome.NOT_NEWER
         if exposure > self._imu.last.stamp:
             return FrameOutcome.FUTURE
+        last, self._last_pixels = self._last_pixels, image[::16, ::16].copy()
+        in_motion = not self._at_rest and (self.filter is not None or self._known_at is not None)
+        if in_motion and np.array_equal(self._last_pixels, last) and last.min() < last.max():  # in the dark all may be equal
+            return FrameOutcome.REPEATED
         return FrameOutcome.TOO_OLD if exposure < self._imu.oldest else None
 
     def _resume(self, exposure: int) -> None:
