@@ -1,16 +1,18 @@
 """Target localiser and powerline mapper as components: images that wait, cameras that become known, and every fault of the inputs."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from perch_core.camera import PinholeCamera, RadialTangentialCamera
 from perch_core.config import from_mapping
 from perch_core.errors import ConfigError
-from perch_core.so3 import quat_from_matrix
+from perch_core.so3 import exp, quat_from_matrix
 from perch_core.values import CameraImage, CameraModel, OdometryState, Transform
 from perch_core.vehicle import load_vehicle
 from perch_perception.camera_component import MAX_QUEUED
+from perch_perception.mounted_camera import MountedCamera
 from perch_perception.powerline_mapper import PowerlineMapper, PowerlineMapperConfig
 from perch_perception.tags import Localization
 from perch_perception.tags.pose import BoardPose
@@ -245,6 +247,31 @@ def test_extrinsics_by_transforms():
     assert len(bench.exposures) == 1
     np.testing.assert_allclose(bench.component.mounted.mount.p_BC, (0.5, 0.0, 0.1))
     np.testing.assert_allclose(bench.component.mounted.mount.R_BC, FRONT.R_BC, atol=1e-12)
+
+
+def test_differences_that_nobody_can_measure_are_no_other_camera():
+    """Intrinsics within 1e-6, extrinsics within 1 um and 1 urad; what is larger is another camera."""
+    mounted = MountedCamera(FRONT, False, "tf", lambda text, period: None)
+    place = Transform("base_link", FRAME, (0.1, 0.0, 0.0), tuple(quat_from_matrix(FRONT.R_BC).tolist()))
+    mounted.take_transform(place)
+    assert mounted.take_model(CameraModel(0, FRAME, CAMERA))
+    mount, turn = mounted.mount, quat_from_matrix(FRONT.R_BC @ exp(np.array([0.0, 5e-7, 0.0])))
+    almost = replace(CAMERA, fx=CAMERA.fx * (1.0 + 5e-7), coefficients=tuple(c + 1e-9 for c in CAMERA.coefficients))
+    assert not any(mounted.take_model(CameraModel(k, FRAME, almost)) for k in range(10))
+    assert not mounted.take_transform(place._replace(p=(0.1 + 5e-7, 0.0, 0.0))) and not mounted.take_transform(place._replace(q=tuple(turn)))
+    assert mounted.mount is mount
+    assert mounted.take_transform(place._replace(p=(0.101, 0.0, 0.0)))
+    assert any(mounted.take_model(CameraModel(k, FRAME, replace(CAMERA, fx=CAMERA.fx * 1.001))) for k in range(10))
+
+
+def test_another_frame_is_believed_when_it_stays():
+    mounted = MountedCamera(FRONT, False, "tf", lambda text, period: None)
+    for frame, x in ((FRAME, 0.1), ("tail", -0.1)):
+        mounted.take_transform(Transform("base_link", frame, (x, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
+    mounted.take_model(CameraModel(0, FRAME, CAMERA))
+    assert not mounted.take_model(CameraModel(1, "tail", CAMERA)) and not mounted.take_model(CameraModel(2, FRAME, CAMERA))
+    assert [mounted.take_model(CameraModel(3, "tail", CAMERA)) for _ in range(6)] == [False] * 4 + [True, False]
+    assert mounted.mount.p_BC[0] == -0.1
 
 
 @pytest.mark.parametrize(("cls", "parameters"), [

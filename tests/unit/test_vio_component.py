@@ -158,6 +158,36 @@ def test_a_vehicle_that_was_started_again_is_followed(shift):
     assert last.stamp > shift and again.error(last, shift)[0] < 0.05
 
 
+@pytest.mark.parametrize(("step", "again"), [(30, 0), (100, 0), (0, 10), (0, 50)])
+def test_a_clock_that_is_set_back_a_little_and_samples_delivered_again_discard_nothing(step, again):
+    """In flight. A step of 100 ms hides so much motion that vision may no longer fit: then VIO goes on from its last pose."""
+    flight = Flight().fly(2.5)
+    before = flight.out["state"][-1].stamp
+    for k in range(again):
+        flight.component.on_imu(flight.samples[0]._replace(stamp=flight.samples[0].stamp - 2_000_000 * (again + 5 - k)))
+    flight.fly(shift=-1_000_000 * step)
+    states, last = flight.out["state"], flight.out["state"][-1]
+    assert not any("restarting" in text for text in flight.out.warnings())
+    assert flight.out["diagnostics"][-1].values["restarts"] <= (step == 100)
+    assert last.stamp > before + 1e9 and all(s.stamp < t.stamp for s, t in zip(states, states[1:]))
+    assert flight.error(last, -1_000_000 * step)[0] < 0.08
+
+
+def test_an_image_that_is_repeated_in_flight_is_no_rest():
+    """The camera freezes in the climb: no pose from then on, and poses again with the images."""
+    flight, held = Flight().fly(2.0), []
+
+    def freeze(image):
+        held.append(image.pixels())
+        return CameraImage(image.stamp, FRAME, 640, 480, "mono8", held[0])
+
+    flight.fly(3.2, tamper=freeze)
+    assert flight.component.result.outcome.name == "REPEATED" and flight.out["state"][-1].stamp < 2.1e9
+    flight.fly()
+    last = flight.out["state"][-1]
+    assert flight.component.result.outcome.name == "TRACKING" and flight.error(last)[0] < 3.0 * math.sqrt(np.trace(last.covariance[:3, :3]))
+
+
 def test_bad_samples_are_dropped_with_a_warning():
     flight = Flight().fly(1.0)
     last = flight.samples[0].stamp

@@ -25,8 +25,11 @@ CONFIG = dataclasses.replace(
     calibration=dataclasses.replace(SHIPPED.calibration, track=NOISE), filter=dataclasses.replace(SHIPPED.filter, slide_turn=0.0, slide_zoom=0.0))
 
 
-def begin(name, seed, give_up=3.5):
-    """The first state that frames and IMU of a motion give, biases and calibration wrong as declared; its error and when it came [s]."""
+def begin(name, seed, give_up=3.5, fps=FRAMES, gap=(0.0, 0.0)):
+    """The first state that frames and IMU of a motion give, biases and calibration wrong as declared; its error and when it came [s].
+
+    In the gap there are no samples of the IMU.
+    """
     rng = np.random.default_rng([20, seed])
     truth, c, imu = Truth(name, rng, RATE, 4.0), CONFIG.calibration, CONFIG.imu
     bias = np.concatenate([rng.normal(0.0, 0.1, 3), rng.normal(0.0, imu.accel_bias_init, 3)])
@@ -35,6 +38,8 @@ def begin(name, seed, give_up=3.5):
     f = truth.f_B + bias[3:] + rng.normal(0.0, imu.accel_noise_density / np.sqrt(h), (n, 3))
     buffer = ImuBuffer(imu, 8.0)
     for k in range(-1, n):
+        if gap[0] < k * h < gap[1]:
+            continue
         buffer.add(ImuSample(round((k + 1) * h * 1e9), tuple(w[max(k, 0)]), tuple(f[max(k, 0)])))
     turn, shift, offset = rng.normal(0.0, c.rotation, 3), rng.normal(0.0, c.translation, 3), rng.normal(0.0, c.time_offset)
     camera, lens = MOUNT.camera, rng.normal(0.0, 1.0, 4) * [c.focal, c.focal, c.centre, c.centre]
@@ -42,8 +47,8 @@ def begin(name, seed, give_up=3.5):
         camera, fx=camera.fx * (1.0 + lens[0]), fy=camera.fy * (1.0 + lens[1]), cx=camera.cx + lens[2], cy=camera.cy + lens[3]))
     tracks = Tracks(rng, truth, real, lambda m: NOISE * rng.normal(size=(m, 2)))
     start = MotionStart(CONFIG, MOUNT)
-    for frame in range(round(give_up * FRAMES)):
-        t = 0.02 + frame / FRAMES
+    for frame in range(round(give_up * fps)):
+        t = 0.02 + frame / fps
         ids, pixels = tracks(*truth.at(t + offset)[:2])
         start.add(frame, round(t * 1e9), ids, observe(camera, pixels))
         state = start.solve(buffer, lambda _: configured_pose(np.zeros(3), 0.0))
@@ -66,6 +71,11 @@ def test_a_start_in_motion_is_as_wrong_as_it_says():
     for part, (own, where) in PARTS.items():
         assert low < np.mean([e[own] @ np.linalg.solve(s.P[where, where], e[own]) for s, e, _ in ends]) / 3.0 < high, part
     assert max(t for _, _, t in ends) < 0.7  # at the second trial, if not at the first
+
+
+def test_a_start_in_motion_over_a_gap_in_the_imu():
+    state, error, _ = begin("hand", 0, fps=10.0, gap=(0.2, 0.9))
+    assert (np.abs(error[3:6]) < 4.0 * np.sqrt(np.diag(state.P)[at.VELOCITY])).all()
 
 
 @pytest.mark.slow

@@ -150,6 +150,51 @@ def test_a_filter_that_does_not_fit_what_it_sees_starts_again_and_says_so():
     assert out[-1][1].restarts >= 1
 
 
+def test_a_covariance_that_is_not_positive_definite_is_a_loss():
+    """In flight: the pose is kept, as uncertain as the covariance was wrong."""
+    flown, frame, outcomes = Flown(200.0), 0.1, []
+    for sample in flown.samples:
+        if sample.stamp > 3.6e9:
+            break
+        flown.vio.add_imu(sample)
+        if sample.stamp * 1e-9 > frame + 0.02:
+            if flown.now < 2.6 <= frame:
+                flown.vio.filter.state.P[at.POSITION, at.POSITION] -= 0.1 * np.eye(3)
+            flown.now = frame
+            result = flown.vio.add_image(round((frame + MOUNT.stamp_offset) * 1e9), BLANK)
+            outcomes += [result] if frame >= 2.6 else []
+            frame += 1 / 30
+    assert outcomes[0].outcome is FrameOutcome.LOST and "positive definite" in outcomes[0].message
+    assert outcomes[-1].outcome is FrameOutcome.TRACKING and outcomes[-1].restarts == 1
+    off = outcomes[-1].estimate.p_WB - flown.motion.sample(np.array([outcomes[-1].estimate.stamp * 1e-9])).p_WB[0]
+    assert np.linalg.norm(off) < 0.3 < np.sqrt(outcomes[-1].estimate.P[0, 0])
+
+
+def test_a_start_that_fails_does_not_turn_the_heading():
+    """0.6 s of a turn by 1 rad/s; the solver raises at ten frames of it."""
+    vio, rng, frame = VisualInertialOdometry(VioConfig(), MOUNT), np.random.default_rng(0), 0.1
+    vio.tracker = GivenTracks(lambda: (np.zeros(0, int), np.zeros((0, 2))))
+    solve, calls = vio._motion_start.solve, []
+
+    def failing(*arguments):
+        calls.append(0)
+        if 5 <= len(calls) < 15:
+            raise np.linalg.LinAlgError("Matrix is not positive definite")
+        return solve(*arguments)
+
+    vio._motion_start.solve = failing
+    for k in range(400):
+        vio.add_imu(ImuSample(2_000_000 * k, (0.0, 0.0, 1.0), tuple(rng.normal(0.0, 2.0, 3) + [0.0, 0.0, GRAVITY])))
+        if 0.002 * k > frame + 0.02:
+            try:
+                vio.add_image(round((frame + MOUNT.stamp_offset) * 1e9), BLANK)
+            except np.linalg.LinAlgError:
+                pass
+            frame += 1 / 30
+    R_WB = vio._known_pose_with_bias(np.zeros(3)).R_WB
+    assert len(calls) > 15 and so3.log(R_WB)[2] == pytest.approx(frame - 1 / 30 - 0.1, abs=0.01)
+
+
 def test_an_unknown_heading_does_not_end_the_filter():
     """At 2 m/s it makes the velocity in W unknown, but not that in B."""
     pose = replace(configured_pose(np.zeros(3), 0.0), covariance=np.diag([0.01, 0.01, 0.01, 3.0]))

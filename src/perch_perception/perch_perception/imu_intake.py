@@ -8,9 +8,11 @@ from perch_core.imu_axes import ImuAxes
 from perch_core.values import ImuSample
 from perch_perception.stamp_guard import StampGuard, StampVerdict
 
+REPETITIONS = 20  # of a sample, after which the sensor counts as frozen: at rest, noise repeats single axes a few times
+
 
 class ImuIntake:
-    """Rotates samples into the axes of B and checks their stamps.
+    """Rotates samples into the axes of B, checks their stamps and warns of a sensor that repeats one sample.
 
     Attributes:
         axes: rotates the samples; holds the transforms of `/tf_static`.
@@ -23,6 +25,8 @@ class ImuIntake:
         self.axes = ImuAxes(warn, sensors)
         self._guard = StampGuard()
         self.restarted = False
+        self._readings: tuple[tuple[float, ...], ...] = ()  # of the last sample
+        self._repeated = 0
 
     def take(self, sample: ImuSample) -> ImuSample | None:
         """Return the sample in the axes of B; None where it cannot be used."""
@@ -32,6 +36,11 @@ class ImuIntake:
             return None
         verdict = self._guard.check(sample.stamp)
         if verdict is StampVerdict.GOOD:
+            readings = (sample.w_B, sample.f_B)
+            self._repeated = self._repeated + 1 if readings == self._readings else 0
+            self._readings = readings
+            if self._repeated >= REPETITIONS:
+                self._warn(f"imu/data_raw: the same sample {REPETITIONS} times in a row: it does not count as rest", 1.0)
             return taken
         if verdict is StampVerdict.REFUSED:
             self._warn(f"imu/data_raw: stamp {sample.stamp} ns does not follow {self._guard.last} ns: not used", 1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 
@@ -13,7 +13,8 @@ from perch_core.values import CameraModel, Transform
 from perch_core.static_transforms import BASE, StaticTransforms
 from perch_core.urdf import optical_frame
 
-CONFIRMATIONS = 5  # camera_info in a row with other intrinsics, after which the change is accepted
+CONFIRMATIONS = 5  # camera_info in a row with other intrinsics or another frame, after which the change is accepted
+TOLERANCE = 1e-6   # up to which intrinsics (relative), positions [m] and attitudes [rad] are the same
 REMINDER = 60.0    # between warnings of a frame's name [s]
 
 
@@ -38,7 +39,7 @@ class MountedCamera:
         self._transforms = StaticTransforms()
         self._camera: Camera | None = None
         self._frame, self._topic = "", f"camera_{nominal.name}/camera_info"
-        self._other: Camera | None = None
+        self._other: CameraModel | None = None
         self._other_count = 0
 
     @property
@@ -64,13 +65,13 @@ class MountedCamera:
         camera, expected = model.camera, optical_frame(self.nominal.name)
         if self._expects_frame and model.frame not in (expected, ""):
             self._warn(f"{self._topic}: frame {model.frame!r} is not {expected!r}, whose pose in the vehicle file is used", REMINDER)
-        if camera is self._camera or camera == self._camera:
-            self._other_count = 0
-            renamed, self._frame = model.frame != self._frame, model.frame
-            return renamed and self._by_transforms and self._place()
-        if self._camera is not None and not self._is_confirmed(camera):
+        renamed = self._by_transforms and model.frame != self._frame
+        if _is_same(camera, self._camera) and not renamed:
+            self._frame, self._other_count = model.frame, 0
             return False
-        self._camera = self.nominal.camera if camera == self.nominal.camera else camera
+        if self._camera is not None and not self._is_confirmed(model):
+            return False
+        self._camera = self.nominal.camera if _is_same(camera, self.nominal.camera) else camera
         self._frame, self._other_count = model.frame, 0
         return self._place()
 
@@ -81,20 +82,22 @@ class MountedCamera:
             self._warn(f"/tf_static: {problem}", 1.0)
         return self._by_transforms and self._camera is not None and self._place()
 
-    def _is_confirmed(self, camera: Camera) -> bool:
-        """Whether other intrinsics were received often enough in a row; a single message of another camera is ignored."""
-        self._other_count = self._other_count + 1 if camera == self._other else 1
-        self._other = camera
+    def _is_confirmed(self, model: CameraModel) -> bool:
+        """Whether another camera or frame was received often enough in a row; a single message of another camera is ignored."""
+        other, self._other = self._other, model
+        follows = other is not None and other.frame == model.frame and _is_same(model.camera, other.camera)
+        self._other_count = self._other_count + 1 if follows else 1
         if self._other_count < CONFIRMATIONS:
-            self._warn(f"{self._topic}: intrinsics changed: not used until {CONFIRMATIONS} consecutive messages agree", 1.0)
+            self._warn(f"{self._topic}: intrinsics or frame changed: not used until {CONFIRMATIONS} consecutive messages agree", 1.0)
             return False
         self._warn(f"{self._topic}: the camera has changed", 0.0)
         return True
 
     def _place(self) -> bool:
         mount, last = self._mount(), self.mount
-        changed = mount is not None and (last is None or mount.camera != last.camera or not (
-            np.array_equal(mount.p_BC, last.p_BC) and np.array_equal(mount.R_BC, last.R_BC)))
+        changed = mount is not None and (last is None or not (
+            _is_same(mount.camera, last.camera) and np.allclose(mount.p_BC, last.p_BC, 0.0, TOLERANCE)
+            and np.allclose(mount.R_BC, last.R_BC, 0.0, TOLERANCE)))
         if changed:
             self.mount = mount
         return changed
@@ -105,3 +108,11 @@ class MountedCamera:
             return self.nominal if self._camera is self.nominal.camera else replace(self.nominal, camera=self._camera)
         place = self._transforms.pose(self._frame)
         return None if place is None else replace(self.nominal, camera=self._camera, p_BC=place[0], R_BC=place[1])
+
+
+def _is_same(a: Camera, b: Camera | None) -> bool:
+    """Whether the intrinsics of two cameras agree."""
+    if a is b or type(a) is not type(b):
+        return a is b
+    x, y = np.hstack(astuple(a)), np.hstack(astuple(b))
+    return len(x) == len(y) and np.allclose(x, y, TOLERANCE, TOLERANCE)

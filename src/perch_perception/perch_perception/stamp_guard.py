@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 
-JUMP = 1_000_000_000        # a stamp further ahead of the last one is not its successor [ns]
+JUMP = 1_000_000_000        # a stamp further from the last one may be that of a restarted stream [ns]
 RESTART_CONFIRMATIONS = 10  # consecutive consistent stamps after which the stream counts as restarted
 
 
@@ -20,8 +20,8 @@ class StampGuard:
     """Checks the stamps of one stream, in the order of their arrival.
 
     One wrong stamp must not invalidate those after it, and a source that was restarted (or whose clock was set) must be accepted
-    again. A stamp that goes back, or jumps ahead, is therefore refused until `RESTART_CONFIRMATIONS` in
-    a row are consistent with each other.
+    again. A stamp further than `JUMP` from the last one is therefore refused until `RESTART_CONFIRMATIONS` in a row are consistent
+    with each other. One that goes back by less is always refused: it was delivered late, or the clock will soon pass the last one.
 
     Attributes:
         last: the last accepted stamp [ns]; None before the first.
@@ -36,8 +36,11 @@ class StampGuard:
     def check(self, stamp: int) -> StampVerdict:
         """Check a stamp [ns]."""
         last = self.last
-        if last is None or 0 < stamp - last <= JUMP:
-            self.last, self._consistent_count = stamp, 0
+        if last is None or abs(stamp - last) <= JUMP:
+            self._consistent_count = 0
+            if last is not None and stamp <= last:
+                return StampVerdict.REFUSED
+            self.last = stamp
             return StampVerdict.GOOD
         follows = self._consistent_count > 0 and 0 < stamp - self._candidate <= JUMP
         self._consistent_count = self._consistent_count + 1 if follows else 1

@@ -25,6 +25,7 @@ from perch_perception.ukf.unscented import GATES, Belief, CovarianceError, Innov
 
 _HISTORY = 0.5  # IMU kept for replay: VIO is late by 0.04 s, by 0.08 s in the campaign on robustness [s]
 _MAX_CONSECUTIVE_REJECTIONS = 15  # rejections in a row after which VIO is taken to have jumped
+_UNTRUSTED_VELOCITIES = 30  # after a start or a jump, only the pose of so many measurements is used, which shows whether their velocity fits
 _LOST_POSITION = 2.0  # 1 sigma beyond which the state is not to be used [m]
 _LOST_ATTITUDE = 0.6  # the same [rad]
 COVARIANCE_STRIDE = 5  # IMU steps per update of the published covariance
@@ -51,7 +52,7 @@ class Estimator:
         self._x = np.zeros(at.NOMINAL_SIZE)  # nominal state now
         self._lag = 0
         self._waiting: list[VioPose] = []
-        self._refused_in_row = 0
+        self._refused_in_row = self._untrusted = 0  # untrusted: coming measurements of which only the pose is used
         self._accepted = self._rejected = self._divergences = 0
         self._nis, self._nis_dimension = 0.0, 0
         self._diverged = False
@@ -160,20 +161,26 @@ class Estimator:
     def _begin(self, pose: VioPose) -> VioOutcome:
         steps = window(self._imu, pose.stamp)
         self._set_base(start.from_pose(self.config, pose, steps) if pose.inertial is None else start.from_state(pose, pose.inertial))
-        self._diverged = False
+        self._diverged, self._untrusted = False, _UNTRUSTED_VELOCITIES
         return VioOutcome.STARTED
 
     def _apply(self, pose: VioPose) -> VioOutcome:
         anchor = self._anchor(pose.stamp)
         prior = self._transform.predict(anchor, self._imu.run(anchor.stamp, pose.stamp), pose.stamp)
+        if self._untrusted > 0 and pose.inertial is None:
+            self._untrusted, pose = self._untrusted - 1, dataclasses.replace(pose, velocity_covariance=None)
         innovation, outcome = self._innovate(prior, pose), VioOutcome.APPLIED
+        if innovation.nis > GATES[len(innovation.residual)] and pose.inertial is None:
+            alone = self._innovate(prior, dataclasses.replace(pose, velocity_covariance=None))
+            if alone.nis <= GATES[len(alone.residual)]:
+                innovation, outcome = alone, VioOutcome.POSE_ONLY
         self._nis, self._nis_dimension = innovation.nis, len(innovation.residual)
         if innovation.nis > GATES[self._nis_dimension]:
             self._refused_in_row += 1
             if self._refused_in_row < _MAX_CONSECUTIVE_REJECTIONS:
                 return VioOutcome.GATED
             prior, outcome = self._inflated(prior, innovation), VioOutcome.JUMPED
-            innovation = self._innovate(prior, pose)
+            innovation, self._untrusted = self._innovate(prior, pose), _UNTRUSTED_VELOCITIES
         self._set_base(self._transform.correct(prior, innovation) if pose.inertial is None else start.from_state(pose, pose.inertial))
         return outcome
 

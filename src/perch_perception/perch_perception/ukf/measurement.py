@@ -16,6 +16,7 @@ class VioOutcome(enum.Enum):
 
     STARTED = "the filter started with it"
     APPLIED = "applied at its stamp"
+    POSE_ONLY = "applied without its twist, which does not fit: it must be in base_link"
     JUMPED = "applied after a jump: many poses in a row disagreed"
     WAITING = "kept until the IMU has reached its stamp"
     GATED = "refused by the innovation gate"
@@ -31,7 +32,7 @@ class VioOutcome(enum.Enum):
     @property
     def used(self) -> bool:
         """Whether the estimate changed."""
-        return self in (VioOutcome.STARTED, VioOutcome.APPLIED, VioOutcome.JUMPED)
+        return self in (VioOutcome.STARTED, VioOutcome.APPLIED, VioOutcome.POSE_ONLY, VioOutcome.JUMPED)
 
 
 class Health(enum.Enum):

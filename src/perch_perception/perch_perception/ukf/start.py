@@ -55,7 +55,7 @@ def from_pose(config: UkfConfig, pose: VioPose, steps: np.ndarray) -> Belief:
     J = np.zeros((at.ERROR_SIZE, 6))
     J[at.D_POSITION, :3], J[at.D_ATTITUDE, 3:] = np.eye(3), R_WB.T
     P += J @ (pose.covariance + added_noise(config.vio)) @ J.T
-    sigma = np.repeat([0.1 if pose.v_B is not None else 2.0, config.imu.gyro_bias_init, config.imu.accel_bias_init], 3)
+    sigma = np.repeat([2.0, config.imu.gyro_bias_init, config.imu.accel_bias_init], 3)
     for block, variance in zip((at.D_VELOCITY, at.D_GYRO_BIAS, at.D_ACCEL_BIAS), np.split(sigma**2, 3)):
         P[block, block] = np.diag(variance)
     belief = Belief(pose.stamp, x, P)

@@ -76,6 +76,7 @@ class VisualInertialOdometry:
         self._last_visual_update: int | None = None  # when vision last changed the state; None: not since the last rest
         self._frame = 0
         self._last_image = -1  # stamp of the last frame used, on the board's clock
+        self._last_pixels = np.zeros(1, np.uint8)  # some of the last image's
         self._last_exposure: int | None = None
         self._last_update = 0  # when vision or rest last updated the filter
         self._observation_counts: deque[tuple[int, int]] = deque(maxlen=_DIVERGENCE_FRAMES)  # observations used and refused
@@ -154,11 +155,11 @@ class VisualInertialOdometry:
         features = self._track(image, exposure)
         self._frame += 1
         if self.filter is None:
-            result = self._try_start(exposure, features)
-        else:
-            result = self._step(exposure, features)
-        self._last_exposure = exposure
-        return result
+            return self._try_start(exposure, features)
+        try:
+            return self._step(exposure, features)
+        except np.linalg.LinAlgError:
+            return self._lose(features, "covariance is not positive definite")
 
     def _problem(self, stamp: int, exposure: int, image: np.ndarray) -> FrameOutcome | None:
         camera = self.mount.camera
@@ -170,6 +171,10 @@ class VisualInertialOdometry:
             return FrameOutcome.NOT_NEWER
         if exposure > self._imu.last.stamp:
             return FrameOutcome.FUTURE
+        last, self._last_pixels = self._last_pixels, image[::16, ::16].copy()
+        in_motion = not self._at_rest and (self.filter is not None or self._known_at is not None)
+        if in_motion and np.array_equal(self._last_pixels, last) and last.min() < last.max():  # in the dark all may be equal
+            return FrameOutcome.REPEATED
         return FrameOutcome.TOO_OLD if exposure < self._imu.oldest else None
 
     def _resume(self, exposure: int) -> None:
@@ -203,6 +208,7 @@ class VisualInertialOdometry:
                 R, J, P = self._rotation
                 self._rotation = R @ part.dR, part.dR.T @ J + part.J[:3, :3], part.dR.T @ P @ part.dR + part.Q[:3, :3]
                 slack = 2e-9 * self._motion_start.gyro_sigma * (exposure - self._last_exposure)
+        self._last_exposure = exposure
         features = self.tracker.track(image, R_BC.T @ turn.T @ R_BC, slack)
         self._recent_views.add(exposure, features)
         return features
@@ -377,7 +383,7 @@ class VisualInertialOdometry:
         """Store the pose and biases for a new start, unless they are not finite."""
         s = self._running.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
-            self._known_pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), _estimate(s).pose_covariance[start.POSE_ROWS])
+            self._known_pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), start.positive(_estimate(s).pose_covariance[start.POSE_ROWS]))
             self._biases = _biases(s)
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport, now: at.State | None = None) -> VioResult:
@@ -394,7 +400,7 @@ def _estimate(s: at.State) -> VioPoseEstimate:
 
 def _biases(state: at.State) -> tuple[np.ndarray, np.ndarray]:
     """Return the biases of gyro and accelerometer, and their variances, shape (6,)."""
-    return np.concatenate([state.gyro_bias, state.accel_bias]), np.diag(state.P)[9:15].copy()
+    return np.concatenate([state.gyro_bias, state.accel_bias]), np.abs(np.diag(state.P)[9:15])
 
 
 def _compile(camera: Camera) -> None:

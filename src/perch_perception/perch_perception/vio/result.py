@@ -22,6 +22,7 @@ class FrameOutcome(enum.Enum):
     NOT_NEWER = "refused: stamp is not newer than the frame before"
     FUTURE = "refused: stamp lies ahead of the IMU"
     TOO_OLD = "refused: older than the IMU history"
+    REPEATED = "refused: in motion, but the same image as the last: the camera has frozen"
     NO_IMU = "refused: no IMU data yet"
     BAD_IMAGE = "refused: not a grey image of the camera's size"
 

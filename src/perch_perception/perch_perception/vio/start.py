@@ -63,6 +63,12 @@ def odometry_pose(pose: VioPose) -> KnownPose:
     return KnownPose(pose.p_WB, so3.quat_to_matrix(pose.q_WB), pose.covariance[POSE_ROWS] + np.diag(np.square(CONFIGURED_POSE_SIGMA)))
 
 
+def positive(covariance: np.ndarray) -> np.ndarray:
+    """Return a covariance as it is or, where it is not positive definite, with the magnitudes of its eigenvalues."""
+    values, vectors = np.linalg.eigh(covariance)
+    return covariance if values[0] > 0.0 else (vectors * np.abs(values)) @ vectors.T
+
+
 def levelled(R_WB: np.ndarray, up_B: np.ndarray) -> np.ndarray:
     """Return the attitude nearest to R_WB in which a direction in B, shape (3,), points up."""
     up_W = R_WB @ (up_B / np.linalg.norm(up_B))

@@ -200,7 +200,7 @@ def _integrate(s: _Unknowns, steps: Sequence[np.ndarray], sigma: np.ndarray) -> 
     for i, rows in enumerate(steps):
         pre = preintegrate(rows, s.biases[:3], s.biases[3:])
         T = pre.duration
-        L = np.linalg.cholesky(pre.Q + 1e-18 * np.eye(9))
+        L = np.linalg.cholesky(pre.Q + max(1e-18, 1e-15 * pre.Q.max()) * np.eye(9))  # one long step, over a gap, makes Q singular
         own = slice(_NOISE + 9 * i, _NOISE + 9 * (i + 1))
         xi = L @ s.z[own]  # of log dR, dp, dv
         dR, dp, dv = pre.dR @ so3.exp(xi[:3]), pre.dp + xi[3:6], pre.dv + xi[6:]
