@@ -35,21 +35,6 @@ def outcomes(climb, drop, until=2.6):
     return out
 
 
-def test_an_imu_that_repeats_one_sample_is_no_rest():
-    """From the beginning: VIO does not start. From 1 s on: it counts as a take-off that shows nothing."""
-    mount = load_vehicle("snapdragon").mounts["down"]
-    for working in (0, 500):
-        rng, vio, frame, image = np.random.default_rng(1), VisualInertialOdometry(VioConfig(), mount), 0, blank(np.random.default_rng(1))
-        for k in range(1300):
-            if k <= working:
-                w, f = tuple(rng.normal(0, 0.002, 3)), tuple(rng.normal(0, 0.05, 3) + [0, 0, 9.81])
-            vio.add_imu(ImuSample(k * 2 * MS, w, f))
-            if 0.002 * k > 0.12 + frame / 30:
-                result, frame = vio.add_image(round((0.1 + frame / 30) * 1e9), image(frame)), frame + 1
-                assert not 400 < k <= working or result.outcome is FrameOutcome.RESTING
-        assert result.outcome is (FrameOutcome.BLIND if working else FrameOutcome.INITIALISING)
-
-
 @pytest.mark.slow
 def test_a_shake_on_the_ground_is_rest_again():
     seen = outcomes(climb=1.5, drop=-1.5)

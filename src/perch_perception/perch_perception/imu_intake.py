@@ -8,11 +8,11 @@ from perch_core.imu_axes import ImuAxes
 from perch_core.values import ImuSample
 from perch_perception.stamp_guard import StampGuard, StampVerdict
 
-REPETITIONS = 20  # of a sample, after which the sensor counts as frozen: at rest, noise repeats single axes a few times
+REPETITIONS = 20  # of a sample, after others: the sensor counts as silent; noise repeats single axes a few times at rest
 
 
 class ImuIntake:
-    """Rotates samples into the axes of B, checks their stamps and warns of a sensor that repeats one sample.
+    """Rotates samples into the axes of B, checks their stamps, and drops those of a sensor that has begun to repeat one sample.
 
     Attributes:
         axes: rotates the samples; holds the transforms of `/tf_static`.
@@ -26,7 +26,7 @@ class ImuIntake:
         self._guard = StampGuard()
         self.restarted = False
         self._readings: tuple[tuple[float, ...], ...] = ()  # of the last sample
-        self._repeated = 0
+        self._changes = self._repeated = 0
 
     def take(self, sample: ImuSample) -> ImuSample | None:
         """Return the sample in the axes of B; None where it cannot be used."""
@@ -37,10 +37,13 @@ class ImuIntake:
         verdict = self._guard.check(sample.stamp)
         if verdict is StampVerdict.GOOD:
             readings = (sample.w_B, sample.f_B)
-            self._repeated = self._repeated + 1 if readings == self._readings else 0
-            self._readings = readings
-            if self._repeated >= REPETITIONS:
-                self._warn(f"imu/data_raw: the same sample {REPETITIONS} times in a row: it does not count as rest", 1.0)
+            if readings == self._readings:
+                self._repeated += 1
+            else:
+                self._readings, self._changes, self._repeated = readings, self._changes + 1, 0
+            if self._changes > 1 and self._repeated >= REPETITIONS:  # one that has never changed may be a source without noise
+                self._warn(f"imu/data_raw: the same sample {REPETITIONS} times in a row, after others: the sensor has frozen; not used", 1.0)
+                return None
             return taken
         if verdict is StampVerdict.REFUSED:
             self._warn(f"imu/data_raw: stamp {sample.stamp} ns does not follow {self._guard.last} ns: not used", 1.0)

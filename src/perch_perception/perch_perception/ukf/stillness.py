@@ -51,8 +51,6 @@ def is_at_rest(steps: np.ndarray, biases: np.ndarray | None = None, variance: np
     """
     if len(steps) < _MIN_SAMPLES or steps[:, DT].sum() < _MIN_COVERAGE * WINDOW:
         return False
-    if (steps[:, 1:7] == steps[0, 1:7]).all():  # a sensor that repeats its last sample: the noise of one that works differs
-        return False
     known = np.array([MAX_GYRO_BIAS, MAX_ACCEL_BIAS]) if variance is None else 3.0 * np.sqrt(variance.reshape(2, 3).max(axis=1))
     sigma = np.sqrt(np.median(steps[:, [GYRO_VARIANCE, ACCEL_VARIANCE]], axis=0))  # of a whole sample: the first and last are cut
     off = _excess_means(steps, biases, known)
