@@ -132,7 +132,7 @@ of 25 cm and 0.96 deg (`symao/open_vins/ov_msckf_result.md`).
 
 ## Tags
 
-Beside pupil-apriltags (`pip install pupil-apriltags`) with `quad_decimate` 1 on the same images:
+Beside pupil-apriltags (`.venv/bin/python -m pip install --no-deps pupil-apriltags`) with `quad_decimate` 1 on the same images:
 """
 WIRES = """
 NASA's reference lacks tags: a detection beyond it is false unless it is on a tag of number 0 that was seen by eye (their places are
