@@ -127,6 +127,12 @@ def test_a_benchmark_fails_where_a_required_value_is_not_met(run_bench, median, 
     assert run_bench(lambda quick: [harness.figure("one", "ms", [median], bar=2.0)], "planner") == code
 
 
+def test_a_benchmark_does_not_replace_a_device_or_pipe(run_bench, tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe")
+    assert run_bench(None, "planner", "--json", str(tmp_path / "pipe")) == 2
+    assert f"error: --json: {tmp_path / 'pipe'}: is no regular file" in capsys.readouterr().err and (tmp_path / "pipe").is_fifo()
+
+
 @pytest.mark.parametrize("file", ["file/figures.json", "."])
 def test_a_benchmark_whose_file_cannot_be_written_does_not_begin(run_bench, monkeypatch, tmp_path, capsys, file):
     monkeypatch.chdir(tmp_path)
