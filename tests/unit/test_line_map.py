@@ -190,10 +190,12 @@ def test_the_map_follows_an_odometry_that_drifts():
     assert errors[0.01] < 0.3 * errors[0.0] and errors[0.01] < 0.025, errors
 
 
-def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it():
-    """The odometry was corrected by more than sightings are associated over: one wire must not become two obstacles."""
+@pytest.mark.parametrize("drop", [0.15, 0.25])
+def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it(drop):
+    """The odometry was corrected by more than sightings are associated over: one wire must not become two obstacles. The larger
+    correction is a jump, with which the wire moves."""
     rng, mapper = np.random.default_rng(11), LineMapper(MapperConfig())
-    wire, jump = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), np.array([0.0, 0.0, -0.15])
+    wire, jump = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), np.array([0.0, 0.0, -drop])
     for k in range(80):
         time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
         believed = true + (jump if k >= 30 else 0.0)
