@@ -194,13 +194,13 @@ def test_the_map_follows_an_odometry_that_drifts():
 def test_a_wire_that_is_seen_anew_beside_its_old_place_replaces_it(drop):
     """The odometry was corrected by more than sightings are associated over: one wire must not become two obstacles. The larger
     correction is a jump, with which the wire moves."""
-    rng, mapper = np.random.default_rng(11), LineMapper(MapperConfig())
+    rng, mapper, poses = np.random.default_rng(11), LineMapper(MapperConfig()), PoseBuffer()
     wire, jump = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), np.array([0.0, 0.0, -drop])
     for k in range(80):
         time, true = 0.1 * k, np.array([0.0, 0.0, 1.6 + 0.8 * abs((k / 15) % 2 - 1)])
         believed = true + (jump if k >= 30 else 0.0)
-        body = BodyState(time, believed, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
-        lines = mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time, believed=believed)]).lines
+        poses.add(BodyState(time, believed, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6))
+        lines = mapper.update(time, poses.at(time), [observe(rng, wire, true, 2e-4, time=time, believed=believed)]).lines
     assert len(lines) == 1
     assert np.linalg.norm((lines[0].segment.centre - [3.0, 0.0, 2.5] - jump)[[0, 2]]) < 0.03
 
@@ -251,6 +251,18 @@ def test_between_two_states_the_correction_is_between_theirs():
     for time in np.linspace(0.0, 0.004, 9):
         state = poses.at(float(time))
         assert state.p_WB[0] - state.corrected[0] == pytest.approx(3.0 * time, abs=1e-9)
+
+
+@pytest.mark.parametrize("step, interval, counted", [(0.16, 0.002, True), (0.14, 0.002, False), (0.16, 0.29, True), (0.16, 0.31, False)])
+def test_a_jump_is_a_correction_at_any_speed_but_not_across_a_pause(step, interval, counted):
+    poses, level, velocity = PoseBuffer(), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.1, 0.0, 0.0])
+    jump = step * np.array([0.6, 0.0, -0.8])
+    for time in (1.0, 1.002):
+        poses.add(BodyState(time, velocity * time, level, velocity, np.zeros(3), np.eye(6) * 1e-6))
+    for later in (0.0, 0.002):
+        time = 1.002 + interval + later
+        poses.add(BodyState(time, velocity * time + jump, level, velocity, np.zeros(3), np.eye(6) * 1e-6))
+        np.testing.assert_allclose(poses.at(time).corrected, counted * jump, atol=1e-12)
 
 
 def test_nothing_is_mapped_from_a_pose_that_is_hardly_known():

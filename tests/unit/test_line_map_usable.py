@@ -11,7 +11,7 @@ from oracles.wires import MOUNT, observe
 from perch_core.values import limits
 from perch_perception.line_mapping import LineDetectionConfig, LineMapper, WireCurve, WireEstimate, detect_lines, place
 from perch_perception.line_mapping import mapper as mapper_module
-from perch_perception.pose_buffer import BodyState
+from perch_perception.pose_buffer import BodyState, PoseBuffer
 
 
 @settings(max_examples=25, deadline=None)
@@ -93,15 +93,16 @@ def test_more_lines_than_receivers_accept_are_not_published():
 @pytest.mark.parametrize("jump", [(0.0, 0.0, -0.35), (0.35, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.3, 0.2)])
 def test_the_map_jumps_with_the_odometry(jump):
     """In a hover: neither a ghost at the wire's old place nor a time without the wire, whether or not it is in view."""
-    rng, mapper = np.random.default_rng(11), LineMapper()
+    rng, mapper, poses = np.random.default_rng(11), LineMapper(), PoseBuffer()
     wires = [WireCurve(np.array([3.0, 0.0, z]), np.array([0.0, 1.0, 0.0])) for z in (2.5, 3.5)]
     for k in range(80):
         time, height = 0.1 * k, 1.6 + 0.8 * abs((k / 15) % 2 - 1)
         true, speed = np.array([0.0, 0.0, height]), -0.53 if k % 30 < 15 else 0.53
         believed = true + (np.array(jump) if k >= 40 else 0.0)
-        body = BodyState(time, believed, np.array([0, 0, 0, 1.0]), np.array([0.0, 0.0, speed]), np.zeros(3), np.eye(6) * 1e-6)
+        poses.add(BodyState(time, believed, np.array([0, 0, 0, 1.0]), np.array([0.0, 0.0, speed]), np.zeros(3), np.eye(6) * 1e-6))
         in_view = wires if k < 35 else wires[:1]
-        lines = mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time, believed=believed) for wire in in_view]).lines
+        seen = [observe(rng, wire, true, 2e-4, time=time, believed=believed) for wire in in_view]
+        lines = mapper.update(time, poses.at(time), seen).lines
         if k > 30:
             assert [line.id for line in lines] == [0, 1]
             for line, wire in zip(lines, wires):

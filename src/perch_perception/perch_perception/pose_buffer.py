@@ -21,6 +21,7 @@ SLOW = 1.0  # speed up to which the odometry's position is smoother than the int
 _COVARIANCE = limits.Covariance(6)  # at 500 Hz its variances alone are looked at
 SPAN = 1.0  # how much history is kept [s]
 MAX_GAP = 0.05  # states further apart than this are not interpolated [s]
+JUMP, JUMP_WITHIN = 0.15, 0.3  # odometry that moves by so much more than its velocity explains, within so long, has jumped [m, s]
 
 
 class StampError(PerchError):
@@ -38,8 +39,8 @@ class BodyState:
         v_WB: velocity in W [m/s], shape (3,).
         w_WB_B: angular velocity in B [rad/s], shape (3,).
         covariance: of position and attitude, errors in the axes of W [m, rad], shape (6, 6).
-        corrected: sum of the odometry's position corrections at speed since the beginning, i.e. of displacement that its velocity
-            does not explain, in W [m], shape (3,). `p_WB - corrected` is as smooth as the vehicle's motion.
+        corrected: sum of the odometry's position corrections at speed and of its jumps since the beginning, i.e. of displacement
+            that its velocity does not explain, in W [m], shape (3,). `p_WB - corrected` is as smooth as the vehicle's motion.
     """
 
     time: float
@@ -117,18 +118,18 @@ class PoseBuffer:
         return replace(_between(a, b, share), corrected=before + share * (self._corrected[right] - before))
 
     def _correction(self, state: BodyState) -> np.ndarray:
-        """Return `corrected` for a state that follows the newest; it does not change across a gap.
+        """Return `corrected` for a state that follows the newest.
 
-        Corrections count above the speed `SLOW`, in full from twice that speed. In a hover vision holds the position, and the
-        velocity's error of some cm/s would accumulate.
+        A jump counts in full. Smaller corrections count above the speed `SLOW`, in full from twice that speed, and not across a
+        gap. In a hover vision holds the position, and the velocity's error of some cm/s would accumulate.
         """
         if not self._states:
             return np.zeros(3)
         before, dt = self._states[-1], state.time - self._times[-1]
-        if dt > MAX_GAP:
-            return self._corrected[-1]
-        share = min(max(math.sqrt(state.v_WB @ state.v_WB) / SLOW - 1.0, 0.0), 1.0)
-        return self._corrected[-1] + share * (state.p_WB - before.p_WB - (0.5 * dt) * (before.v_WB + state.v_WB))
+        unexplained = state.p_WB - before.p_WB - (0.5 * dt) * (before.v_WB + state.v_WB)
+        jumped = dt < JUMP_WITHIN and math.sqrt(unexplained @ unexplained) > JUMP
+        share = 1.0 if jumped else 0.0 if dt > MAX_GAP else min(max(math.sqrt(state.v_WB @ state.v_WB) / SLOW - 1.0, 0.0), 1.0)
+        return self._corrected[-1] + share * unexplained
 
 
 def _between(a: BodyState, b: BodyState, share: float) -> BodyState:

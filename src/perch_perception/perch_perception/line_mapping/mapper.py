@@ -30,7 +30,6 @@ ATTACHED_COUNT = 3    # surplus of images that show a line attached to the surfa
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
 MAX_LINES = limits.LIMITS[PowerlineMap]["lines"].count_max  # that receivers accept
 FORGET_BEYOND = 50.0  # a triangulated wire out of view that is further away from the vehicle is dropped [m]
-JUMP, JUMP_WITHIN = 0.15, 0.3  # odometry that moves by so much more than its velocity explains, within so long, has jumped [m, s]
 
 
 @dataclass(frozen=True)
@@ -56,17 +55,15 @@ class _Track:
 class LineMapper:
     """Tracks, triangulates and stores wires. The state is the list of wires.
 
-    Wires are stored in a frame without the odometry's position corrections and jumps: these move neither the vehicle nor the wire
-    relative to the vehicle. The map is published in the odometry's present W.
+    Wires are stored in a frame without the odometry's corrections (`BodyState.corrected`): these move neither the vehicle nor the
+    wire relative to the vehicle. The map is published in the odometry's present W.
     """
 
     def __init__(self, settings: MapperConfig | None = None) -> None:
         self.settings = settings or MapperConfig()
         self._tracks: list[_Track] = []
         self._next_id = 0
-        self._body: BodyState | None = None
-        self._jumped = np.zeros(3)  # sum of the odometry's jumps [m]
-        self._corrected = np.zeros(3)  # and of its corrections [m]
+        self._body: BodyState | None = None  # of the last image; its position is without the corrections
 
     def update(self, time: float, body: BodyState, seen: Sequence[LineObservation],
                attached: Callable[[LineObservation, WireCurve], bool | None] | None = None) -> PowerlineMap:
@@ -79,11 +76,8 @@ class LineMapper:
             attached: returns whether a sighting of a wire (both without the odometry's corrections) lies on the surface beside
                 it; None: undecided.
         """
-        if self._body is not None:
-            self._jumped = self._jumped + _jump(self._body, replace(body, p_WB=body.p_WB - body.corrected - self._jumped))
-        self._corrected = body.corrected + self._jumped
-        self._body = replace(body, p_WB=body.p_WB - self._corrected)
-        seen = [replace(one, p_WC=one.p_WC - self._corrected) for one in seen]
+        self._body = replace(body, p_WB=body.p_WB - body.corrected)
+        seen = [replace(one, p_WC=one.p_WC - body.corrected) for one in seen]
         changed: set[int] = set()
         owners = associate(self._tracks, seen)
         for one, owner in zip(seen, owners):
@@ -130,7 +124,7 @@ class LineMapper:
         lines = [line for line, problem in checked if not problem]
         refused = [f"line {line.id}: {problem}" for line, problem in checked if problem]
         if len(lines) > MAX_LINES and self._body is not None:
-            p_WB = self._body.p_WB + self._corrected
+            p_WB = self._body.p_WB + self._body.corrected
             lines = sorted(lines, key=lambda line: float(line.segment.distance(p_WB)))[:MAX_LINES]
             refused.append(f"only the nearest {MAX_LINES} lines are published")
         return PowerlineMap(nanoseconds(time), tuple(sorted(lines, key=lambda line: line.id)), bool(missing), "; ".join(missing + refused))
@@ -211,6 +205,7 @@ class LineMapper:
             return [], track.refusal
         if track.extent is None:
             return [], "its ends were not seen yet"
+        assert self._body is not None  # it was seen from somewhere
         low, high = track.extent
         length = high - low
         sag = abs(estimate.curve.curvature) * length**2 / 8.0
@@ -224,7 +219,7 @@ class LineMapper:
             sigma = largest_sigma(covariance)
             if sigma > self.settings.max_sigma:
                 return [], f"position uncertainty of {sigma:.2f} m is too large"
-            start, end = _chord(estimate.curve, a, b, radius, self._corrected).ends
+            start, end = _chord(estimate.curve, a, b, radius, self._body.corrected).ends
             lines.append(MappedPowerline(track.id + PIECE_IDS * k, tuple(start.tolist()), tuple(end.tolist()), radius, covariance,
                                          self._direction_sigma(estimate), track.count))
         return lines, None
@@ -243,13 +238,6 @@ class LineMapper:
         assert self._body is not None
         attitude = np.linalg.eigvalsh(self._body.covariance[3:, 3:])[-1]
         return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + attitude))
-
-
-def _jump(before: BodyState, body: BodyState) -> np.ndarray:
-    """Return the motion from one image to the next that the velocity does not explain, (3,) [m]; 0 where it is no jump."""
-    dt = body.time - before.time
-    unexplained = body.p_WB - before.p_WB - 0.5 * dt * (before.v_WB + body.v_WB)
-    return unexplained if dt < JUMP_WITHIN and np.linalg.norm(unexplained) > JUMP else np.zeros(3)
 
 
 def _distance(track: _Track, p_WB: np.ndarray) -> float:
