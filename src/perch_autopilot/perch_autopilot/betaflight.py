@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
-from perch_core.values import NANOSECONDS, STALE, Command, ControllerCommand, ImuSample, RatesThrust
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, RatesThrust
 from perch_core.vehicle import GRAVITY
 from perch_autopilot import msp
 from perch_autopilot.clock import clock_jump
@@ -121,7 +121,7 @@ class Betaflight(Component[BetaflightParameters]):
 
     def on_command(self, command: ControllerCommand) -> None:
         """Stop the motors on KILL, also where no controller is there to obey it."""
-        if command.command == Command.KILL and not 0 < command.stamp < (self._now or 0) - STALE:
+        if command.command == Command.KILL and not command.is_stale(self._now or 0):
             self._link.kill()
 
     # -- from it -----------------------------------------------------------------------------------------------------

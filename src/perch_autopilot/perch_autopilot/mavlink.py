@@ -20,7 +20,7 @@ import numpy as np
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
-from perch_core.values import NANOSECONDS, STALE, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust
 from perch_autopilot import frames
 from perch_autopilot.clock import MAX_STEP, clock_jump
 from perch_autopilot.offboard import ANGLE_BOOST, ARDUPILOT, GUID_OPTIONS, HEARTBEAT_TIMEOUT, PX4, THRUST_AS_THRUST, Offboard, Request
@@ -135,7 +135,7 @@ class Mavlink(Component[MavlinkParameters]):
 
     def on_command(self, command: ControllerCommand) -> None:
         """Stop the motors on KILL in any mode and at any height, also where no controller is there to obey it."""
-        if command.command == Command.KILL and not 0 < command.stamp < (self._now or 0) - STALE:
+        if command.command == Command.KILL and not command.is_stale(self._now or 0):
             self._command = None
             self._send_command(_ARM_DISARM, 0.0, _FORCED)
 

@@ -193,8 +193,8 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"way out of trajectory {order.id} refused: {error}")
 
     def on_command(self, command: ControllerCommand) -> None:
-        """Carry out a command, or report why it is refused. A command older than `STALE` is ignored."""
-        if 0 < command.stamp < self._stamps.newest - STALE:
+        """Carry out a command, or report why it is refused. A stale command is ignored."""
+        if command.is_stale(self._stamps.newest):
             self.warn(f"command {command.command} of {seconds(command.stamp):.3f} s is too old: ignored")
             return
         try:

@@ -7,7 +7,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
-from perch_core.values.stamps import nanoseconds, seconds
+from perch_core.values.stamps import STALE, nanoseconds, seconds
 
 Floats = tuple[float, ...]
 
@@ -76,6 +76,10 @@ class ControllerCommand(NamedTuple):
     stamp: int
     command: int
     reason: str
+
+    def is_stale(self, now: int) -> bool:
+        """Whether it is too old to be obeyed at a time [ns]; a command with the stamp 0, of a sender without a clock, never is."""
+        return 0 < self.stamp < now - STALE
 
 
 class MotorCommand(NamedTuple):
