@@ -18,14 +18,11 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from perch_core.errors import ConfigError
 from perch_core.processes import without_collector
-from perch_eval.arguments import output_file
 from perch_eval.revision import code_version, command_line
 
 _STATISTICS = {"median": lambda x: float(np.median(x)),
@@ -104,17 +101,6 @@ def provenance() -> dict[str, object]:
     machine = {"cpu": model, "cores": os.cpu_count(), "load_1min": round(os.getloadavg()[0], 2),
                "python": platform.python_version(), "numpy": np.__version__, "system": platform.platform()}
     return {**code_version(), "command": command_line(), "machine": machine}
-
-
-def results_file(path: Path | None, option: str) -> AbstractContextManager[Path | None]:
-    """Return `output_file` of a path, or a context of None where there is none.
-
-    Raises:
-        ConfigError: the path is a device or pipe, which a file must not replace.
-    """
-    if path and path.exists() and not (path.is_file() or path.is_dir()):
-        raise ConfigError(option, str(path), "is no regular file")
-    return output_file(path, option) if path else nullcontext()
 
 
 def as_json(group_figures: dict[str, list[Figure]]) -> list[dict[str, object]]:

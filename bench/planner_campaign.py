@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 if __name__ == "__main__":
@@ -30,7 +30,7 @@ from perch_core import config
 from perch_core.errors import ConfigError
 from perch_core.json_values import to_text, write_json
 from perch_core.vehicle import load_vehicle
-from perch_eval.arguments import command, command_parser, count
+from perch_eval.arguments import command, command_parser, count, output_file
 from perch_planner.planner import plan
 from perch_planner.problem import PerchSettings
 from perch_planner.refusals import PerchRefusal
@@ -90,7 +90,7 @@ def campaign(arguments: argparse.Namespace) -> int:
         found = verify(answer.trajectory.durations, answer.trajectory.coefficients, requirements(problem, settings, vehicle), arguments.step)
         broken.extend([seed, finding.requirement, finding.excess, finding.time] for finding in found)
 
-    with harness.results_file(arguments.out, "--out") as draft:
+    with output_file(arguments.out) if arguments.out else nullcontext() as draft:
         head, begin = harness.provenance(), time.time()
         try:
             with suppress(Exception):  # loads the compiled kernels, which is no part of a plan's time

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 from perch_setup import ROOT, command_parser, enter, leave_quietly_on_interrupt
@@ -40,9 +41,10 @@ def measure(arguments: argparse.Namespace) -> int:
     sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "oracles")]  # the closed loop and the oracles of the tests
     import harness
     from perch_core.json_values import write_json
+    from perch_eval.arguments import output_file
 
     results, seeds, errors = {}, {}, {}
-    with harness.results_file(arguments.json, "--json") as draft:
+    with output_file(arguments.json, "--json") if arguments.json else nullcontext() as draft:
         begun = harness.provenance()  # the load is that of others
         for group in [arguments.group] if arguments.group else GROUPS:
             print(f"== {group}", flush=True)

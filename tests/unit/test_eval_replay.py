@@ -4,6 +4,7 @@ import base64
 import html
 import io
 import json
+import os
 import math
 import re
 import resource
@@ -235,6 +236,12 @@ def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_drawn(rec
         monkeypatch.setattr(command, drawing, lambda *_: pytest.fail("drawn"))
     assert main([str(recorded[0]), option, f"/proc/{name}"]) == 2
     assert f"error: {option}: /proc/{name}: cannot be written: No such file or directory" in capsys.readouterr().err
+
+
+def test_a_pipe_is_not_replaced_by_a_picture(recorded, tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.png")
+    assert main([str(recorded[0]), "--out", str(tmp_path / "pipe.png")]) == 2
+    assert f"error: --out: {tmp_path / 'pipe.png'}: is no regular file" in capsys.readouterr().err and (tmp_path / "pipe.png").is_fifo()
 
 
 def test_the_vehicle_is_that_of_the_recording_or_of_its_report(reported, tmp_path, monkeypatch, capsys):

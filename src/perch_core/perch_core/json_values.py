@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from perch_core.files import replacement
 
 
 def finite(value: Any) -> Any:
@@ -30,9 +31,5 @@ def write_json(file: Path, value: Any) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    draft = file.with_name(f".{os.getpid()}-{file.name}")
-    try:
+    with replacement(file) as draft:
         draft.write_text(to_text(value))
-        draft.replace(file)
-    finally:
-        draft.unlink(missing_ok=True)

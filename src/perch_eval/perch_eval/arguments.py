@@ -10,10 +10,11 @@ import socket
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from perch_core.errors import ConfigError, PerchError
+from perch_core.files import replacement
 from perch_core.processes import discard_closed_output
 
 _locked: dict[Path, int] = {}  # folder of results -> its open file, which holds the lock
@@ -107,29 +108,28 @@ def locked_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def output_file(path: Path, option: str = "--out") -> Iterator[Path]:
-    """Yield the path of a draft, which replaces the file at the end; after an error or Ctrl-C, the file is as before.
+    """As `replacement`, in a folder that is created where it is missing.
 
     Args:
         path: of the file.
         option: command-line option that names the file, for error messages.
 
     Raises:
-        ConfigError: the file cannot be written; as far as possible, this is found before the body is run.
+        ConfigError: the path is a device or pipe, which a file must not replace, or the file cannot be written; as far as possible,
+            this is found before the body is run.
     """
-    draft = path.parent / f".{os.getpid()}-{path.name}"
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ConfigError(option, str(path), "is no regular file")
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
             pass
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        yield draft
-        draft.replace(path)
+        with replacement(path) as draft:
+            yield draft
     except OSError as error:
         raise ConfigError(option, str(path), f"cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):
-            draft.unlink()
 
 
 def open_network(address: str | None) -> None:

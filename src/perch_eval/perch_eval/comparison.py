@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from perch_core.errors import PerchError
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
-from perch_eval.arguments import command, command_parser
+from perch_eval.arguments import command, command_parser, output_file
 from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
 from perch_eval.margins import limits, margins, number
@@ -64,11 +63,8 @@ def _write(args: argparse.Namespace) -> int:
     names = args.names or [f"{path}{namespace}" for path, namespace in zip(args.flights, args.namespace)]
     sides = [read(*each, vehicle=args.vehicle) for each in zip(names, COLOURS, args.flights, args.namespace)]
     page = compare(*sides)
-    try:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(page)
-    except OSError as error:
-        raise PerchError(f"--out {args.out}: cannot be written: {error.strerror}") from None
+    with output_file(args.out) as draft:
+        draft.write_text(page)
     print(f"page: {args.out}")
     return 0
 

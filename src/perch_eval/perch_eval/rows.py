@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from perch_core.files import replacement
+
 
 def rows_of(path: Path) -> Iterator[Any]:
     """Yield the rows of a file, also while it is being written; none if there is no file. An incomplete last line is ignored.
@@ -30,9 +32,8 @@ class Rows:
         Raises:
             OSError: it cannot be written.
         """
-        draft = path.with_suffix(".part")
-        draft.write_text("".join(json.dumps(row) + "\n" for row in known))
-        draft.replace(path)
+        with replacement(path) as draft:
+            draft.write_text("".join(json.dumps(row) + "\n" for row in known))
         self._file = path.open("a")
 
     def add(self, row: Any) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.sensors import Sensors, load_sensors
-from perch_eval.arguments import command, command_parser
+from perch_eval.arguments import command, command_parser, output_file
 from perch_eval.recordings.asl import root_of
 from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
 from perch_eval.recordings.check import check
@@ -72,8 +72,8 @@ def _import(args: argparse.Namespace) -> int:
     if args.out is None:
         print(text, end="")
     else:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text(text)
+        with output_file(args.out) as draft:
+            draft.write_text(text)
         load_sensors(args.out)
         print(f"sensor file: {args.out}")
     return 0
