@@ -319,9 +319,7 @@ class FlightController:
                 if not x.airborne and not x.at_ground:
                     x = x._replace(airborne=True)
                 imu_fresh = self._inputs.imu_age(x.now) <= self.settings.odometry_timeout
-                x = self.supervisor.act(self._thrust.updated(x, self.law, self.compensator, imu_fresh))
-                if x.mode is State.HOVERING and x.elapsed > self.settings.silence_time and not self._schedule.waiting:
-                    x = landing(x, f"landing: no order for {self.settings.silence_time:.0f} s", self.settings.land_speed)
+                x = self.supervisor.act(self._thrust.updated(x, self.law, self.compensator, imu_fresh), self._schedule.waiting)
         return self._finish_step(x)
 
     def step_blind(self, stamp: float) -> StepResult:

@@ -76,13 +76,16 @@ class Supervisor:
         """Whether the specific force, by the IMU, does not point along b3."""
         return self._tilted_contact is not None and self._tilted_contact.tilted
 
-    def act(self, x: FlightState) -> FlightState:
-        """Monitor one step of a flight; return the state, in another mode where necessary."""
+    def act(self, x: FlightState, waiting: bool) -> FlightState:
+        """Monitor one step of a flight; return the state, in another mode where necessary. `waiting`: whether a trajectory is pending."""
         if x.mode is not self._mode:
             self.restart(x.mode)
         if x.weak and not isinstance(x.source, WeakLanding) and (reason := self._insufficient_thrust_reason(x)):
             return landing_weak(x, reason, self.settings.land_speed)
-        return MONITORS[x.mode](self, x)
+        x = MONITORS[x.mode](self, x)
+        if x.mode is State.HOVERING and x.elapsed > self.settings.silence_time and not waiting:
+            return landing(x, f"landing: no order for {self.settings.silence_time:.0f} s", self.settings.land_speed)
+        return x
 
     def _landing(self, x: FlightState) -> FlightState:
         if isinstance(x.source, WeakLanding):

@@ -14,7 +14,7 @@ from perch_control.mission.values import (
     Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target)
 
 ANSWER_TIMEOUT = 5.0  # for the planner's answer, beyond its latency [s]
-ACCEPTANCE_TIMEOUT = 1.0  # a controller that is still attached so long after a plan's start has not accepted it [s]
+DEPARTURE_ACCEPTANCE_TIMEOUT = 1.0  # a controller that is still attached so long after a plan's start has not accepted it [s]
 _THRUST = 0.5  # of each rotor, soon after its start [N]
 
 
@@ -68,7 +68,7 @@ class Departure(MissionMachine):
         if isinstance(plan, Refusal):
             self._leave_without_plan(inputs, outputs, plan.message)
             return
-        self._flown_id, self._due = self._new_id(), inputs.time + LEAD + ACCEPTANCE_TIMEOUT
+        self._flown_id, self._due = self._new_id(), inputs.time + LEAD + DEPARTURE_ACCEPTANCE_TIMEOUT
         outputs.perch, outputs.trajectory_id = plan.starting(inputs.time + LEAD), self._flown_id
 
     def _leave_without_plan(self, inputs: Inputs, outputs: Outputs, why: str) -> None:

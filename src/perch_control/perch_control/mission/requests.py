@@ -41,20 +41,18 @@ def plan_answer(plan: PerchPlan | PowerlinePlan | Unavailable) -> Plan | Refusal
     if not plan.success or plan.trajectory is None:
         return Refusal(plan.message or "no reason was given")
     trajectory = plan.trajectory
-    duration, at_end, recovery_start = trajectory.duration, AtEnd.CONTACT, -1.0
+    order, duration = TrajectoryOrder(0, trajectory, AtEnd.CONTACT), trajectory.duration
     if isinstance(plan, PowerlinePlan):
         if plan.recovery_start < 0.0:  # a perch alone, which the planner offers where it finds no recovery
             return Refusal(plan.message)
         if isinstance(trajectory, FlatTrajectory):
             return Refusal("invalid plan: trajectory: polynomials, not states")
-        if problem := limits.LIMITS[TrajectoryOrder]["at_end"].problem(plan.at_end):
-            return Refusal(f"invalid plan: at_end: {problem}")
-        duration, at_end, recovery_start = plan.perch_time or plan.recovery_time, AtEnd(plan.at_end), plan.recovery_start
+        order, duration = order._replace(at_end=plan.at_end, recovery_start=plan.recovery_start), plan.perch_time or plan.recovery_time
     if not 0.0 < duration <= trajectory.duration + _ROUNDING:
         return Refusal(f"invalid plan: perch after {duration:g} s, in a trajectory of {trajectory.duration:g} s")
-    if problem := limits.problem(TrajectoryOrder(0, trajectory, at_end, recovery_start=recovery_start)):
+    if problem := limits.problem(order):
         return Refusal(f"invalid plan: {problem}")
-    return Plan(trajectory, duration, at_end, recovery_start)
+    return Plan(trajectory, duration, AtEnd(order.at_end), order.recovery_start)
 
 
 def flown_order(id: int, plan: Plan, contact_time: float) -> TrajectoryOrder:

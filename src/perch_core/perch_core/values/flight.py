@@ -27,19 +27,19 @@ class TrajectoryOrder(NamedTuple):
     Attributes:
         id: chosen by the sender.
         trajectory: its `start_time` is a whole number of nanoseconds, as in a stamp.
-        at_end: action at its end.
+        at_end: action at its end, a number of `AtEnd`; a planner may have sent another, which the mission refuses.
         contact_time: time-out of the wait for a contact after the end [s].
         recovery_start: time at which an appended recovery begins, negative: none [s].
     """
 
     id: int
     trajectory: FlatTrajectory | SampledTrajectory
-    at_end: AtEnd = AtEnd.HOLD
+    at_end: int = AtEnd.HOLD
     contact_time: float = 0.0
     recovery_start: float = -1.0
 
     @classmethod
-    def of(cls, id: int, trajectory: FlatTrajectory | SampledTrajectory, at_end: AtEnd = AtEnd.HOLD, contact_time: float = 0.0,
+    def of(cls, id: int, trajectory: FlatTrajectory | SampledTrajectory, at_end: int = AtEnd.HOLD, contact_time: float = 0.0,
            recovery_start: float = -1.0) -> TrajectoryOrder:
         """Return an order whose start is rounded to whole nanoseconds, the resolution of a message."""
         start = seconds(nanoseconds(trajectory.start_time))
