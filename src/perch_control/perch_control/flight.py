@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import cos, dist, radians
+from math import dist
 
 import numpy as np
 
 from perch_core.values import Command
-from perch_core.vector3 import axes_of, norm
-from perch_core.vehicle import GRAVITY, ControlGains, Vehicle
+from perch_core.vehicle import ControlGains, Vehicle
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
 from perch_control.descent import BlindDescent
+from perch_control.estimator_verdict import EstimatorVerdict
 from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
 from perch_control.inner_loop import DelayedReference
@@ -23,24 +23,17 @@ from perch_control.modes import CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
 from perch_control.recovery import Recovery
+from perch_control.resting import check_arming, has_fallen, idling
 from perch_control.rotor_health import RotorHealth
 from perch_control.schedule import Schedule
 from perch_control.sensor_inputs import SensorInputs
 from perch_control.supervisor import Supervisor, committed
 from perch_control.thrust_model import ThrustModel
 
-_SPARE_SHARE = 0.01             # weight of a step of 2 ms in the mean margin: 0.2 s
-_UNKNOWN_MOTION = (0.0,) * 6    # position and velocity in a descent without position
+_SPARE_SHARE = 0.01           # weight of a step of 2 ms in the mean margin: 0.2 s
+_UNKNOWN_MOTION = (0.0,) * 6  # position and velocity in a descent without position
 _AT_REST = (0.0,) * 9 + (1.0, 0.0, 0.0, 0.0)
-_MARGIN_PERCH = 0.15            # a perch is refused where the mean thrust margin in hover is less: one rotor is far weaker
-_IDLE_TIME = 10.0               # armed on the ground without a trajectory for so long: motors off [s]
-_ARM_TILT = cos(radians(45.0))  # of the largest tilt at which motors start and idle on the ground
-_ARM_FORCE_MIN = 0.5 * GRAVITY  # smallest specific force along b3 there [m/s^2]
-_FALLEN = 0.5                   # at rest so far below the place of ATTACHED, nothing there carries the vehicle [m]
-_FALLING = 1.0                  # faster than this it is still falling, and the motors may save it [m/s]
-_COASTING, _DIVERGED = 2, 3     # perch_msgs/EstimatorStatus
-_COASTING_HOVER = 1.0           # no VIO for so long: hover; the position drifts by centimetres until then [s]
-_COASTING_LAND = 3.0            # the same: descend without position [s]
+_MARGIN_PERCH = 0.15          # a perch is refused where the mean thrust margin in hover is less: one rotor is far weaker
 
 
 class FlightController:
@@ -58,7 +51,7 @@ class FlightController:
         self.supervisor = Supervisor(vehicle, settings)
         self.compensator: L1Augmentation | None = None
         self._schedule = Schedule()
-        self._estimator_problem = ""  # of its last status; empty: none
+        self._estimator_verdict = EstimatorVerdict()  # on its last status
         self._thrust = ThrustModel(vehicle)
         self._inputs = SensorInputs()
         self._period = MeasuredPeriod()
@@ -157,19 +150,7 @@ class FlightController:
     def _arm(self, x: FlightState, why: str) -> FlightState:
         if x.mode is State.ARMED or x.flying:
             return x
-        if x.mode not in (State.DISARMED, State.ATTACHED):
-            raise CommandRefused(f"arm is refused: {x.mode.name.lower()}; disarm first")
-        if self.odometry_age > self.settings.odometry_timeout:
-            raise CommandRefused("arm is refused: no usable odometry" + (f" ({why})" if (why := self._inputs.refusal) else ""))
-        if self._inputs.imu_age(x.now) > self.settings.odometry_timeout:
-            raise CommandRefused("arm is refused: no usable IMU samples")
-        if x.mode is State.DISARMED and _tilted(x):
-            raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
-        if _fallen(x):
-            raise CommandRefused("arm is refused: the vehicle has come off and lies below its perch; disarm first")
-        if x.mode is State.DISARMED and self._thrust.measured_specific_thrust < _ARM_FORCE_MIN:
-            force = self._thrust.measured_specific_thrust
-            raise CommandRefused(f"arm is refused: the IMU measures {force:.1f} m/s^2 along b3 at rest: its axes are configured wrongly")
+        check_arming(x, self._inputs, self._thrust.measured_specific_thrust, self.settings.odometry_timeout)
         x = self._thrust.reset(x, self.law, self.compensator)
         if x.mode is State.ATTACHED:
             return recovered(x, "leaving the surface or wire")
@@ -182,17 +163,17 @@ class FlightController:
         Raises:
             TrajectoryRefused: the trajectory may not be flown.
         """
-        x = self.flight_state
+        x, problem = self.flight_state, self._estimator_verdict.problem
         if self.odometry_age > self.settings.odometry_timeout:
             raise TrajectoryRefused("no usable odometry")
         if self._schedule.leaving(x) or x.land_requested:
             raise TrajectoryRefused("the running manoeuvre is about to be left")
-        if _fallen(x):
+        if has_fallen(x):
             raise TrajectoryRefused("the vehicle has come off and lies below its perch; disarm first")
         if x.mode is State.ATTACHED:
             x = self.flight_state = self._thrust.reset(x, self.law, self.compensator)
-        elif x.mode is State.ARMED and self._estimator_problem:
-            raise TrajectoryRefused(self._estimator_problem)
+        elif x.mode is State.ARMED and problem:
+            raise TrajectoryRefused(problem)
         elif x.mode not in (State.ARMED, State.TRACKING, State.HOVERING):
             raise TrajectoryRefused(f"the vehicle is {x.mode.name.lower()}, not armed and ready")
         if not x.accepts(order):
@@ -252,15 +233,11 @@ class FlightController:
 
     def estimator(self, state: int, vio_age: float, message: str) -> None:
         """Act on the estimator's health: state as in `perch_msgs/EstimatorStatus`, age of the last VIO measurement [s]."""
-        diverged, coasting = state == _DIVERGED, state == _COASTING and vio_age > _COASTING_HOVER
-        problem = f"the estimator has diverged: {message}" if diverged else f"no VIO for {vio_age:.1f} s" if coasting else ""
-        self._estimator_problem = problem
-        if diverged:
-            self.descend(problem, moving=False)
-        elif coasting and vio_age > _COASTING_LAND:
-            self.descend(problem)
-        elif coasting:
-            self.flight_state = self._leave_or_brake(self.flight_state, problem)
+        verdict = self._estimator_verdict = EstimatorVerdict.of(state, vio_age, message)
+        if not verdict.position:
+            self.descend(verdict.problem, moving=verdict.velocity)
+        elif verdict.problem:
+            self.flight_state = self._leave_or_brake(self.flight_state, verdict.problem)
 
     def _leave_or_brake(self, x: FlightState, reason: str) -> FlightState:
         """Leave a trajectory by a planned way out, or brake; continue where even the hardest brake would end in the surface."""
@@ -377,26 +354,12 @@ class FlightController:
         return State.FAILED if self.supervisor.tilted else State.DISARMED
 
     def _idle(self, x: FlightState) -> tuple[FlightState, StepResult]:
-        if x.mode is State.ARMED and not self._schedule.waiting and x.elapsed > _IDLE_TIME:
-            x = motors_off(x, State.DISARMED, f"disarmed: no trajectory for {_IDLE_TIME:g} s")
-        if x.mode is State.ARMED and _tilted(x):
-            x = motors_off(x, State.DISARMED, "disarmed: the vehicle is tilted by more than 45 deg")
+        x = idling(x, self._schedule.waiting)
         armed = x.mode is State.ARMED
         speed = (x.vehicle.speed_min,) * 4 if armed else (0.0,) * 4
         rotors = x.rotors.following(speed, x.state_estimate or _AT_REST, x.vehicle)
         return (x.commanded(rotors, 1.0, x.spare, 0.0),
                 StepResult(armed, speed, event="; ".join(x.events), loop=rotors.sent))
-
-
-def _tilted(x: FlightState) -> bool:
-    """Whether the vehicle is tilted too far for its motors to run on the ground."""
-    return axes_of(x.state_estimate[6:10])[2][2] < _ARM_TILT
-
-
-def _fallen(x: FlightState) -> bool:
-    """Whether an attached vehicle lies below its perch. Only its height counts: the surface may carry it sideways, a wire lets it swing."""
-    return (x.mode is State.ATTACHED and x.setpoint().p[2] - x.state_estimate[2] > _FALLEN
-            and norm(x.state_estimate[3:6]) < _FALLING)
 
 
 def _check_flying(x: FlightState, name: str) -> None:

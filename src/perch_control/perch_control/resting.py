@@ -1,0 +1,64 @@
+"""A vehicle at rest, on the ground or on its perch: whether its motors may start, and for how long they idle."""
+
+from __future__ import annotations
+
+from math import cos, radians
+
+from perch_core.vector3 import axes_of, norm
+from perch_core.vehicle import GRAVITY
+from perch_control.flight_state import FlightState
+from perch_control.maneuvers import motors_off
+from perch_control.modes import CommandRefused, State
+from perch_control.sensor_inputs import SensorInputs
+
+_IDLE_TIME = 10.0               # armed on the ground without a trajectory for so long: motors off [s]
+_ARM_TILT = cos(radians(45.0))  # of the largest tilt at which motors start and idle on the ground
+_ARM_FORCE_MIN = 0.5 * GRAVITY  # smallest specific force along b3 there [m/s^2]
+_FALLEN = 0.5                   # at rest so far below the place of ATTACHED, nothing there carries the vehicle [m]
+_FALLING = 1.0                  # faster than this it is still falling, and the motors may save it [m/s]
+
+
+def check_arming(x: FlightState, inputs: SensorInputs, specific_thrust: float, timeout: float) -> None:
+    """Check whether the motors may start.
+
+    Args:
+        x: state of the vehicle, whose motors are off.
+        inputs: its sensors.
+        specific_thrust: last measured specific force along b3 [m/s^2].
+        timeout: largest age of odometry and IMU samples [s].
+
+    Raises:
+        CommandRefused: they may not.
+    """
+    if x.mode not in (State.DISARMED, State.ATTACHED):
+        raise CommandRefused(f"arm is refused: {x.mode.name.lower()}; disarm first")
+    if inputs.age > timeout:
+        raise CommandRefused("arm is refused: no usable odometry" + (f" ({inputs.refusal})" if inputs.refusal else ""))
+    if inputs.imu_age(x.now) > timeout:
+        raise CommandRefused("arm is refused: no usable IMU samples")
+    if x.mode is State.DISARMED and _tilted(x):
+        raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
+    if has_fallen(x):
+        raise CommandRefused("arm is refused: the vehicle has come off and lies below its perch; disarm first")
+    if x.mode is State.DISARMED and specific_thrust < _ARM_FORCE_MIN:
+        raise CommandRefused(f"arm is refused: the IMU measures {specific_thrust:.1f} m/s^2 along b3 at rest: its axes are configured wrongly")
+
+
+def has_fallen(x: FlightState) -> bool:
+    """Whether an attached vehicle lies below its perch. Only its height counts: the surface may carry it sideways, a wire lets it swing."""
+    return (x.mode is State.ATTACHED and x.setpoint().p[2] - x.state_estimate[2] > _FALLEN
+            and norm(x.state_estimate[3:6]) < _FALLING)
+
+
+def idling(x: FlightState, waiting: bool) -> FlightState:
+    """Stop the motors where they idle in vain or the vehicle is tilted; `waiting`: whether a trajectory is pending."""
+    if x.mode is State.ARMED and not waiting and x.elapsed > _IDLE_TIME:
+        x = motors_off(x, State.DISARMED, f"disarmed: no trajectory for {_IDLE_TIME:g} s")
+    if x.mode is State.ARMED and _tilted(x):
+        x = motors_off(x, State.DISARMED, "disarmed: the vehicle is tilted by more than 45 deg")
+    return x
+
+
+def _tilted(x: FlightState) -> bool:
+    """Whether the vehicle is tilted too far for its motors to run on the ground."""
+    return axes_of(x.state_estimate[6:10])[2][2] < _ARM_TILT
