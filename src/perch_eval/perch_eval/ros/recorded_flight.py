@@ -34,24 +34,16 @@ class RecordedFlight(Flight):
         prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else "/"
         self._undecoded: dict[str, tuple[str, list[tuple[int, bytes]]]] = {}  # channel and messages that have not been requested
         damage: list[str] = []
-        restart = ""
-        last: dict[str, int] = {}    # time of the last message of each channel [ns]
-        restarted: set[str] = set()  # channels whose time has gone back at the last restart
+        restarts = _Restarts()
         for topic, type_of, time, data in read(path, on_damage=damage.append):
             key = topic.removeprefix(prefix).lstrip("/")
             channel = _channel(key, type_of)
-            if channel is not None and (topic.startswith(prefix) or channel.startswith("/")):
-                if time < last.get(key, time) - RESTART:
-                    if key in STREAMS and (key in restarted or not restarted):
-                        self._undecoded = {name: found for name, found in self._undecoded.items() if name == "robot_description"}
-                        last, restarted = {}, {key}
-                        restart = f"time has restarted: only what follows the last restart, at {1e-9 * time:.3f} s, is read"
-                    elif restarted and key not in restarted:  # messages of before that were written after the first one of another channel
-                        self._undecoded.pop(key, None)
-                        restarted.add(key)
-                last[key] = time
-                self._undecoded.setdefault(key, (channel, []))[1].append((time, data))
-        super().__init__({key: [] for key in self._undecoded}, str(path), "; ".join(filter(None, [restart, *damage])))
+            if channel is None or not (topic.startswith(prefix) or channel.startswith("/")):
+                continue
+            for earlier in restarts.outdated(key, time, self._undecoded):
+                self._undecoded.pop(earlier, None)
+            self._undecoded.setdefault(key, (channel, []))[1].append((time, data))
+        super().__init__({key: [] for key in self._undecoded}, str(path), "; ".join(filter(None, [restarts.message, *damage])))
 
     def values(self, channel: str) -> list[tuple[float, Any]]:
         """Return (time [s], value) of a channel in order; its messages are decoded at the first call."""
@@ -59,6 +51,33 @@ class RecordedFlight(Flight):
             self._channels[channel] = list(_decoded(*self._undecoded[channel]))
             del self._undecoded[channel]
         return super().values(channel)
+
+
+class _Restarts:
+    """Search for restarts of time among the messages of a recording, in the order of the file.
+
+    Attributes:
+        message: about the last restart; empty: there was none.
+    """
+
+    def __init__(self) -> None:
+        self.message = ""
+        self._last: dict[str, int] = {}   # time of the last message of each channel [ns]
+        self._restarted: set[str] = set()  # channels whose time has gone back at the last restart
+
+    def outdated(self, key: str, time: int, known: Iterable[str]) -> list[str]:
+        """Take the next message's channel and time [ns]; return those of the known channels whose messages until then are of an
+        earlier flight."""
+        gone_back = time < self._last.get(key, time) - RESTART
+        self._last[key] = time
+        if gone_back and key in STREAMS and (key in self._restarted or not self._restarted):
+            self._last, self._restarted = {key: time}, {key}
+            self.message = f"time has restarted: only what follows the last restart, at {1e-9 * time:.3f} s, is read"
+            return [one for one in known if one != "robot_description"]
+        if gone_back and self._restarted and key not in self._restarted:
+            self._restarted.add(key)
+            return [key]  # messages of before that were written after the first one of another channel
+        return []
 
 
 def _decoded(channel: str, messages: list[tuple[int, bytes]]) -> Iterator[tuple[float, Any]]:
