@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,24 +53,22 @@ def fly_cancelled(scenario: str, seed: int, before: float) -> CancelledFlight:
         PerchError: the scenario is invalid.
     """
     loaded = load_scenario(scenario)
-    loop = arrange(loaded, seed, Sensing())
-    goal = loop.send("mission", goal_of(loaded))
-    stamp, cancelled, ended = 0, 0, 0
-    rate, distance = 0.0, np.inf
-    while stamp < LIMIT and not (ended and stamp - ended > LINGER):
-        stamp = loop.step()
-        if not cancelled:
-            for order in loop.trace.values("trajectory")[-1:]:
-                if order.contact_after is not None and order.trajectory.start_time + order.contact_after - seconds(stamp) <= before:
-                    cancelled, goal.cancel_requested = stamp, True
-        else:
-            x, pad = loop.vehicle.simulation.state, loop.vehicle.simulation.pad
-            rate = max(rate, float(np.linalg.norm(x.w_WB_B)))
-            distance = min(distance, float((x.p_WB - pad.p_WS) @ pad.normal))
-            ended = ended or (stamp if goal.result is not None else 0)
-    simulation = loop.vehicle.simulation
+    with closing(arrange(loaded, seed, Sensing())) as loop:
+        goal, simulation = loop.send("mission", goal_of(loaded)), loop.vehicle.simulation
+        stamp, cancelled, ended = 0, 0, 0
+        rate, distance = 0.0, np.inf
+        while stamp < LIMIT and not (ended and stamp - ended > LINGER):
+            stamp = loop.step()
+            if not cancelled:
+                for order in loop.trace.values("trajectory")[-1:]:
+                    if order.contact_after is not None and order.trajectory.start_time + order.contact_after - seconds(stamp) <= before:
+                        cancelled, goal.cancel_requested = stamp, True
+            else:
+                x, pad = simulation.state, simulation.pad
+                rate = max(rate, float(np.linalg.norm(x.w_WB_B)))
+                distance = min(distance, float((x.p_WB - pad.p_WS) @ pad.normal))
+                ended = ended or (stamp if goal.result is not None else 0)
     statuses: list[ControllerStatus] = [s for s in loop.trace.values("controller/status") if s.stamp >= cancelled]
-    loop.close()
     state = State(statuses[-1].state)
     hovering = state is State.HOVERING and float(np.linalg.norm(simulation.state.v_WB)) < MAX_HOVER_SPEED
     held = simulation.plant.contact.attached or simulation.plant.cables.hold.active
