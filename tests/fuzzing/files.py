@@ -20,7 +20,7 @@ import numpy as np
 import yaml
 
 from perch_core import config
-from perch_core.component import Job, JobFailed, JobStopped
+from perch_core.job import Job, JobFailed, JobStopped
 from perch_core.errors import PerchError
 from perch_core.isolated import IsolatedRunner
 from perch_core.tag_board import TagBoard, load_board

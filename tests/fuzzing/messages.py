@@ -20,9 +20,10 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-from perch_core.component import Input, Job, JobFailed, JobStopped, Output, ports
+from perch_core.component import Input, Output, ports
 from perch_core.errors import PerchError
 from perch_core.isolated import IsolatedRunner
+from perch_core.job import Job, JobFailed, JobStopped
 from perch_core.ros import topics
 from fuzzing import sense
 from fuzzing.report import Report

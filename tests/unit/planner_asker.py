@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from perch_core.component import Component, Job
+from perch_core.component import Component
+from perch_core.job import Job
 from perch_core.isolated import IsolatedRunner
 
 

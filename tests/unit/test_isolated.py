@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from perch_core import isolated
-from perch_core.component import Job, JobFailed, JobStopped
+from perch_core.job import Job, JobFailed, JobStopped
 from perch_core.errors import ConfigError, PerchError, PlanningRefusal
 from perch_core.isolated import IsolatedRunner
 
@@ -273,7 +273,7 @@ def test_the_processes_end_with_a_caller_that_is_killed(jobs: ModuleType) -> Non
     caller = Path(str(jobs.__file__)).with_name("caller.py")
     caller.write_text("""
 import os, signal, isolated_jobs
-from perch_core.component import Job
+from perch_core.job import Job
 from perch_core.isolated import IsolatedRunner
 runner = IsolatedRunner()
 runner.wait_ready()

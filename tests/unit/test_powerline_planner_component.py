@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from perch_core.component import Job, JobFailed, JobStopped
+from perch_core.job import Job, JobFailed, JobStopped
 from perch_core.errors import ConfigError
 from perch_core.isolated import IsolatedRunner
 from perch_core.values import AtEnd, MappedPowerline, PowerlinePlan, PowerlinePlanRequest

@@ -15,8 +15,8 @@ from perch_control.laws import LAWS, law_class
 from perch_control.nmpc import chosen_lines
 from perch_control.parameters import ControllerParameters
 from perch_control.reference import FlatReference, SampledReference, with_unit_quaternions
-from perch_core.component import Job
 from perch_core.errors import ConfigError, PerchError
+from perch_core.job import Job
 from perch_core.lines import Segment
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import AtEnd, TrajectoryOrder

@@ -30,7 +30,7 @@ from dataclasses import dataclass, field
 from functools import wraps
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar, overload
 
-from perch_core.errors import PerchError
+from perch_core.job import Job, run_now
 from perch_core.values.limits import LIMITS, problem
 
 C = TypeVar("C")
@@ -182,43 +182,6 @@ class Action(_Port):
     def __init__(self, goal: type, feedback: type, result: type, channel: str) -> None:
         super().__init__(channel)
         self.goal, self.feedback, self.result = goal, feedback, result
-
-
-class JobStopped(PerchError):
-    """A job did not end within its time limit."""
-
-
-class JobFailed(PerchError):
-    """An isolated job has no result: it was refused, crashed, ran out of memory, or raised an unexpected exception."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """Long computation, `function(*arguments)`, that the host runs outside the component's thread.
-
-    Attributes:
-        function: module-level function; where `isolated`, it, `arguments` and its result must be picklable.
-        arguments: its arguments.
-        then: called on the component's thread with the result, or with the exception that ended the job.
-        limit: wall-clock time from submission [s], after which the job ends with `JobStopped`; None: no limit. The time spent
-            waiting for earlier jobs counts.
-        isolated: run in a process that can be killed; otherwise on a thread, to which `limit` does not apply.
-    """
-
-    function: Callable[..., Any]
-    arguments: tuple[Any, ...]
-    then: Callable[[Any], None]
-    limit: float | None = None
-    isolated: bool = False
-
-
-def run_now(job: Job) -> None:
-    """Run a job at once, on the caller's thread and without a limit."""
-    try:
-        result = job.function(*job.arguments)
-    except PerchError as error:
-        result = error
-    job.then(result)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from math import inf
 from multiprocessing.connection import Connection, Pipe, wait
 from typing import Any
 
-from perch_core.component import Job, JobFailed, JobStopped
+from perch_core.job import Job, JobFailed, JobStopped
 
 MEMORY = 4 << 30
 """Address space of a job's process [byte]; numpy, CasADi and compiled kernels use 0.4 GiB of it before the first job."""

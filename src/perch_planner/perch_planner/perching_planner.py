@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from perch_core import config, so3
-from perch_core.component import Component, Diagnostics, Job, JobStopped, Service
+from perch_core.component import Component, Diagnostics, Service
 from perch_core.config import quantity, text
 from perch_core.errors import ConfigError, PerchError
+from perch_core.job import Job, JobStopped
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory
 from perch_core.values import PerchPlan, PerchPlanRequest, limits, seconds

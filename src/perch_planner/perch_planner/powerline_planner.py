@@ -8,9 +8,10 @@ from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from typing import Any
 
-from perch_core.component import Component, Diagnostics, Job, JobStopped, Service
+from perch_core.component import Component, Diagnostics, Service
 from perch_core.config import text
 from perch_core.errors import PerchError, PlanningRefusal
+from perch_core.job import Job, JobStopped
 from perch_core.rotor_model import RotorModel
 from perch_core.values import PowerlinePlan, PowerlinePlanRequest, limits
 from perch_core.vehicle import load_vehicle

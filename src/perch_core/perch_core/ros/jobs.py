@@ -6,7 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from perch_core.component import Job
+from perch_core.job import Job
 from perch_core.errors import PerchError
 from perch_core.isolated import IsolatedRunner
 

@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
-from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Timer, ports, run_now
+from perch_core.component import Action, Client, Component, Input, Output, Service, Unavailable, Timer, ports
 from perch_core.errors import PerchError
+from perch_core.job import run_now
 from perch_core.values import NANOSECONDS
 from perch_sim.lockstep.packet import Codec, Packet
 from perch_sim.lockstep.tasks import START_DEADLINE
