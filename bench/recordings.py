@@ -22,6 +22,7 @@ if __name__ == "__main__":
 
 import real_motion
 import recordings_scores as scores
+import recordings_wires
 from perch_core.errors import ConfigError
 from perch_core.json_values import finite, write_json
 from perch_core.processes import single_threaded_blas
@@ -85,10 +86,10 @@ RECORDINGS = {
     "aprilgrid": Recording("AprilGrid", "five photographs of Kalibr's 6 x 6 grid on a monitor, two modules of border, scaled to 1000 px",
                            ("powei-lin/aprilgrid/example/data",), "BSD-3", scores.aprilgrid),
     "street": Recording("street wires", "12 photographs of wires before sky, houses and trees",
-                        ("smilopintus/power-line-detection/test images",), "none named", scores.street),
+                        ("smilopintus/power-line-detection/test images",), "none named", recordings_wires.street),
     "pldu": Recording("PLDU", "photographs from drones over towns, with every wire traced", ("SnorkerHeng/PLD-UAV/PLDU",), "none named",
-                      scores.traced),
-    "pldm": Recording("PLDM", "the same, in mountains", ("SnorkerHeng/PLD-UAV/PLDM",), "none named", scores.traced),
+                      recordings_wires.traced),
+    "pldm": Recording("PLDM", "the same, in mountains", ("SnorkerHeng/PLD-UAV/PLDM",), "none named", recordings_wires.traced),
 }
 MISSING = "not available"
 RACING_ERROR_MAX = 0.2  # required of every seed: error at the end of racing motion, share of the path [%]

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import recordings_scores as scores
+import recordings_wires as wires
 from perch_core import so3
 from scipy.io import savemat
 
@@ -33,8 +34,8 @@ def test_a_tag_beyond_the_reference_is_false_unless_it_was_seen_there():
 
 def test_an_arc_is_on_a_wire_where_it_passes_a_point_of_it():
     arc = np.stack([np.linspace(0.0, 400.0, 9), 100.0 + np.linspace(-1.0, 1.0, 9)**2 * 40.0], axis=1)
-    assert scores._is_on(arc, [(0, 0), (200, 107)]) and scores._is_on(arc, [(225, 100)])
-    assert not scores._is_on(arc, [(200, 109), (410, 140)]) and not scores._is_on(arc, [])
+    assert wires._is_on(arc, [(0, 0), (200, 107)]) and wires._is_on(arc, [(225, 100)])
+    assert not wires._is_on(arc, [(200, 109), (410, 140)]) and not wires._is_on(arc, [])
 
 
 def test_apriltags_corners_are_in_our_order_and_pixels():
@@ -61,7 +62,7 @@ def test_precision_and_recall_of_wires_are_by_length(tmp_path):
     inner = np.empty((1, 1), object)
     inner[0, 0] = {"Boundaries": edges}
     savemat(tmp_path / "test_gt" / "1.mat", {"groundTruth": inner})
-    right, found, covered, traced = scores._lengths(tmp_path / "test" / "1.png", tmp_path / "test_gt" / "1.mat")
+    right, found, covered, traced = wires._lengths(tmp_path / "test" / "1.png", tmp_path / "test_gt" / "1.mat")
     assert right / found == pytest.approx(0.5, abs=0.02) and covered / traced == pytest.approx(0.5, abs=0.02)
 
 
