@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import dist
 
 import numpy as np
 
 from perch_core.values import Command
 from perch_core.vehicle import ControlGains, Vehicle
+from perch_control import actuation
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
-from perch_control.descent import BlindDescent
 from perch_control.estimator_verdict import EstimatorVerdict
 from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
-from perch_control.inner_loop import DelayedReference
 from perch_control.l1 import L1Augmentation
-from perch_control.law import NO_COMPENSATION, Law
+from perch_control.law import Law
 from perch_control.maneuvers import (
     attached, descending, entered, hover_after_jump, land_on_command, landing, motors_off, recovered, stopped)
 from perch_control.modes import CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
-from perch_control.period import NOMINAL_PERIOD, MeasuredPeriod
-from perch_control.recovery import Recovery
+from perch_control.period import MeasuredPeriod
 from perch_control.resting import check_arming, has_fallen, idling
 from perch_control.rotor_health import RotorHealth
 from perch_control.schedule import Schedule
@@ -30,10 +27,7 @@ from perch_control.sensor_inputs import SensorInputs
 from perch_control.supervisor import Supervisor, committed
 from perch_control.thrust_model import ThrustModel
 
-_SPARE_SHARE = 0.01           # weight of a step of 2 ms in the mean margin: 0.2 s
-_UNKNOWN_MOTION = (0.0,) * 6  # position and velocity in a descent without position
-_AT_REST = (0.0,) * 9 + (1.0, 0.0, 0.0, 0.0)
-_MARGIN_PERCH = 0.15          # a perch is refused where the mean thrust margin in hover is less: one rotor is far weaker
+_MARGIN_PERCH = 0.15  # a perch is refused where the mean thrust margin in hover is less: one rotor is far weaker
 
 
 class FlightController:
@@ -309,57 +303,26 @@ class FlightController:
 
     def _finish_step(self, x: FlightState) -> StepResult:
         """Return the command that follows from the state, and store the state after it."""
-        x, result = self._descent(x, x.blind) if x.blind is not None else self._fly(x) if x.flying else self._idle(x)
+        x, result = self._actuated(x)
         self.flight_state = x._replace(events=()) if x.events else x
         return result
 
-    def _fly(self, x: FlightState) -> tuple[FlightState, StepResult]:
-        setpoint = self.supervisor.setpoint(x)
-        contact = x.time_to_contact
-        state, delay = x.rotors.ahead(x.state_estimate, x.vehicle), x.rotors.delay
-        reference = DelayedReference(x, delay) if delay > 0.0 else x
-        out = self.law.control(state, reference, x.rotors.at_effect, self._compensation(x, contact), max(contact - delay, 0.0))
-        rotors = x.rotors.following(out.rotor_speed, state, x.vehicle, out.w_C)
-        top = x.vehicle.thrust_max
-        margin, spare = (top - max(out.rotor_thrust)) / top, x.spare
-        if x.mode is State.HOVERING:
-            spare += _SPARE_SHARE * (self._period.value / NOMINAL_PERIOD) * (margin - spare)
-        x = x.commanded(rotors, margin, spare, dist(setpoint.p, x.state_estimate[0:3]))
-        if self.supervisor.landed(x, setpoint):
-            return self._idle(motors_off(x, self._state_after_landing, "landed, motors off"))
-        return x, StepResult(True, out.rotor_speed, setpoint, out.q_C, out.w_C, out.dw_C, out.wrench, margin, "; ".join(x.events), rotors.sent)
+    def _actuated(self, x: FlightState) -> tuple[FlightState, StepResult]:
+        if x.blind is not None:
+            if not x.blind.landed:
+                return actuation.descend(x, x.blind)
+            x = self._landed(x, "landed without position, motors off")
+        elif x.flying:
+            setpoint = self.supervisor.setpoint(x)
+            x, result = actuation.fly(x, setpoint, self.law, self.compensator, self._period.value)
+            if not self.supervisor.landed(x, setpoint):
+                return x, result
+            x = self._landed(x, "landed, motors off")
+        return actuation.rest(idling(x, self._schedule.waiting))
 
-    def _compensation(self, x: FlightState, contact: float) -> tuple[float, ...]:
-        """Return the compensation of disturbances; forces of the ground or of a wall must not be estimated as disturbances."""
-        if self.compensator is None:
-            return NO_COMPENSATION
-        if x.at_ground or isinstance(x.source, Recovery):  # what a recovery follows, an impact or a blow, is in the estimate
-            self.compensator.reset()
-            return NO_COMPENSATION
-        if x.mode in (State.LANDING, State.RECOVERING) or contact <= 0.0 or x.may_touch(0.0):
-            return self.compensator.hold()
-        return self.compensator.update(x.state_estimate, x.rotors.speed, x.now)
-
-    def _descent(self, x: FlightState, blind: BlindDescent) -> tuple[FlightState, StepResult]:
-        if blind.landed:
-            return self._idle(motors_off(x, self._state_after_landing, "landed without position, motors off"))
-        speed, thrust = blind.rotors(x.rotors.at_effect.speed)
-        rotors = x.rotors.following(speed, (*_UNKNOWN_MOTION, *blind.attitude.q, *blind.attitude.w), x.vehicle)
-        x = x.commanded(rotors, (x.vehicle.thrust_max - max(thrust)) / x.vehicle.thrust_max, x.spare, x.position_error)
-        return x, StepResult(True, speed, wrench=blind.wrench(), margin=x.margin, event="; ".join(x.events), loop=rotors.sent)
-
-    @property
-    def _state_after_landing(self) -> State:
-        """State of the controller after a landing: FAILED where the vehicle lies tilted, else DISARMED."""
-        return State.FAILED if self.supervisor.tilted else State.DISARMED
-
-    def _idle(self, x: FlightState) -> tuple[FlightState, StepResult]:
-        x = idling(x, self._schedule.waiting)
-        armed = x.mode is State.ARMED
-        speed = (x.vehicle.speed_min,) * 4 if armed else (0.0,) * 4
-        rotors = x.rotors.following(speed, x.state_estimate or _AT_REST, x.vehicle)
-        return (x.commanded(rotors, 1.0, x.spare, 0.0),
-                StepResult(armed, speed, event="; ".join(x.events), loop=rotors.sent))
+    def _landed(self, x: FlightState, message: str) -> FlightState:
+        """Stop the motors after a landing: FAILED where the vehicle lies tilted, else DISARMED."""
+        return motors_off(x, State.FAILED if self.supervisor.tilted else State.DISARMED, message)
 
 
 def _check_flying(x: FlightState, name: str) -> None:
