@@ -514,3 +514,25 @@ def test_attached_is_not_repeated_once_the_vehicle_has_left():
     while world.outcome is None:
         world.tick()
     assert world.commands == [Command.ARM, Command.ATTACHED] and "not attached" in world.outcome.message
+
+
+def test_a_plan_that_is_sent_after_refused_ones_is_awaited_until_its_own_start():
+    mission, outputs = SurfaceMission(MissionSettings()), Outputs()
+    mission._others = {}
+
+    def plan(start):
+        return mission.running(Plan(rest_to_rest(np.zeros(3), np.ones(3), 0.0, 0.0, 3.0, start), 3.0), Target(0.0, np.ones(3), Q_PERCH, 0.01, 0.01))
+
+    def starts_believed(time, trajectory_id):
+        state = State(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
+        mission._return_to_flown_plan(Inputs(time, state, True, ControllerState.TRACKING, "", trajectory_id, None, np.zeros((0, 3))))
+        return mission._running.plan.start_time
+
+    mission._fly(plan(1.0), outputs)
+    flown = mission._flown_id
+    for start in (2.0, 2.05):
+        mission._fly_new_plan(plan(start), outputs)
+    assert [starts_believed(time, flown) for time in (2.09, 2.11)] == [2.05, 1.0]
+    mission._fly_new_plan(plan(2.3), outputs)
+    assert [starts_believed(time, flown) for time in (2.2, 2.39, 2.41)] == [2.3, 2.3, 1.0]
+    assert starts_believed(2.42, flown + 3) == 2.3, "accepted after all"

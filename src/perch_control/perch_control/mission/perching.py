@@ -38,7 +38,7 @@ class PerchingMission(MissionMachine, Generic[R]):
     _target: Target           # from the query on
     _running: R               # from the first trajectory on
     _others: dict[int, R]     # plans of this attempt that were sent to the controller, other than the running one, by id
-    _given_up = 0             # id of the last plan that was not accepted
+    _given_up = 0             # plans up to this id are not awaited any more
     _first_id: int            # of an attempt's first trajectory; ids grow
     _first_start: float       # when that starts [s]
     _attached_sent_at: float  # time of the last command ATTACHED [s]
@@ -191,9 +191,9 @@ class PerchingMission(MissionMachine, Generic[R]):
         """Return to the plan that the controller flies, where it has not accepted the one after it."""
         if inputs.trajectory_id == self._flown_id or inputs.trajectory_id not in self._others:
             return
-        next_id = max(inputs.trajectory_id, self._given_up) + 1
-        successor = self._others.get(next_id, self._running)
-        if inputs.time > successor.plan.start_time + REPLACED_TIMEOUT:
-            self._others[self._flown_id], self._given_up = self._running, next_id
-            self._flown_id, self._running = inputs.trajectory_id, self._others[inputs.trajectory_id]
+        plans = self._others | {self._flown_id: self._running}
+        awaited = [id for id in plans if id > max(inputs.trajectory_id, self._given_up)]
+        if not awaited or inputs.time > plans[min(awaited)].plan.start_time + REPLACED_TIMEOUT:
+            self._others, self._given_up = plans, max(plans)
+            self._flown_id, self._running = inputs.trajectory_id, plans[inputs.trajectory_id]
             self.message = f"the new plan was not accepted: {inputs.controller_message}"
