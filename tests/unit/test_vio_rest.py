@@ -113,7 +113,7 @@ def rest(seed, attitude, times, dark, fps=2.0, rate=100.0):
     imu, R = config.imu, so3.exp(ATTITUDES[attitude])
     p, sigma = np.array([0.5, 0.2, 1.2]), np.array([0.001] * 3)
     vio = VisualInertialOdometry(config, mount, p + rng.normal(0.0, sigma), 0.0)
-    vio._known_pose = replace(vio._known_pose, R_WB=so3.exp([0.0, 0.0, rng.normal(0.0, CONFIGURED_POSE_SIGMA[3])]) @ R)  # as left by a lost filter
+    vio._last_pose.pose = replace(vio._last_pose.pose, R_WB=so3.exp([0.0, 0.0, rng.normal(0.0, CONFIGURED_POSE_SIGMA[3])]) @ R)  # as left by a lost filter
     bias = rng.normal(0.0, np.repeat([imu.gyro_bias_init, imu.accel_bias_init], 3))
     walk = np.repeat([imu.gyro_bias_walk, imu.accel_bias_walk], 3) / np.sqrt(rate)
     noise = np.repeat([imu.gyro_noise_density, imu.accel_noise_density], 3) * np.sqrt(rate)

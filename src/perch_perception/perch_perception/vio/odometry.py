@@ -10,7 +10,6 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
-from perch_core import so3
 from perch_core.camera import Camera
 from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample, OdometryState
@@ -23,6 +22,7 @@ from perch_perception.vio import state as at
 from perch_perception.vio.bearing import POINT, Bearings, observe, residuals
 from perch_perception.vio.config import VioConfig
 from perch_perception.vio.divergence import SPEED_MAX, divergence, velocity_sigma
+from perch_perception.vio.last_pose import LastPose
 from perch_perception.vio.msckf import FrameReport, Msckf
 from perch_perception.vio.preintegration import preintegrate
 from perch_perception.vio.recent_views import MIN_TRACKS, STATIC_DURATION, RecentViews
@@ -63,12 +63,11 @@ class VisualInertialOdometry:
         self.filter: Msckf | None = None
         self.restarts = 0
         self._imu = ImuBuffer(config.imu, 2.0 + motion_start.DURATION)
-        self._known_pose = start.configured_pose(p_WB, yaw)
+        self._last_pose = LastPose(start.configured_pose(p_WB, yaw))
         self._floor = floor
         self._views: deque[tuple[int, Features]] = deque()  # (exposure, features) at rest, not passed by the filter
         self._recent_views = RecentViews()
         self._biases: tuple[np.ndarray, np.ndarray] | None = None  # of gyro and accelerometer (6,) and their variances, of the last filter
-        self._known_at: tuple[int, float] | None = None  # stamp of the known pose in motion, and the speed then [ns, m/s]
         self._odometry: deque[OdometryState] | None = deque(maxlen=_KEPT_ODOMETRY)  # of the estimator; None from the first start on
         self._at_rest = False
         self._noise_factor = 1.0  # variance of the IMU at rest over that of the sensor's noise, as last measured
@@ -97,15 +96,14 @@ class VisualInertialOdometry:
         elif self.filter is not None:
             self._drop_filter()
         else:
-            self._known_pose = self._known_pose_with_bias(self._rotation_bias)
+            self._last_pose.pose = self._last_pose.present()
         self._views.clear()
         self._set_camera(mount)
 
     def _begin_motion_start(self) -> None:
         """Begin to collect frames for a start in motion."""
         self._motion_start = motion_start.MotionStart(self.config, self.mount, None if self._biases is None else self._biases[0][:3])
-        # rotation since the pose was known, by the gyro less a bias, its derivative by that, and its covariance from noise
-        self._rotation, self._rotation_bias = (np.eye(3), np.zeros((3, 3)), np.zeros((3, 3))), self._motion_start.gyro_bias
+        self._last_pose.begin_rotation(self._motion_start.gyro_bias)
 
     @property
     def gyro_sigma(self) -> float:
@@ -172,7 +170,7 @@ class VisualInertialOdometry:
         if exposure > self._imu.last.stamp:
             return FrameOutcome.FUTURE
         last, self._last_pixels = self._last_pixels, image[::16, ::16].copy()
-        in_motion = not self._at_rest and (self.filter is not None or self._known_at is not None)
+        in_motion = not self._at_rest and (self.filter is not None or self._last_pose.known_at is not None)
         if in_motion and np.array_equal(self._last_pixels, last) and last.min() < last.max():  # in the dark all may be equal
             return FrameOutcome.REPEATED
         return FrameOutcome.TOO_OLD if exposure < self._imu.oldest else None
@@ -183,14 +181,11 @@ class VisualInertialOdometry:
         A vehicle that rested before the gap, and whose IMU is at rest after it, rests there still. Another may have turned by any angle.
         """
         left = self._at_rest and not is_at_rest(window(self._imu, exposure))
-        moved = left or self._known_at is not None or (self.filter is not None and not self._at_rest)
+        moved = left or self._last_pose.known_at is not None or (self.filter is not None and not self._at_rest)
         if self.filter is not None:
             self._drop_filter(_UNSEEN_SPEED if left else 0.0)
         if moved:
-            covariance = self._known_pose.covariance.copy()
-            covariance[3, :3] = covariance[:3, 3] = 0.0
-            covariance[3, 3] = np.pi**2 / 3.0  # all headings alike
-            self._known_pose = replace(self._known_pose, covariance=covariance)
+            self._last_pose.forget_heading()
         self.tracker.reset()
         self._recent_views.clear()
         self._views.clear()
@@ -204,9 +199,7 @@ class VisualInertialOdometry:
             steps = self._imu.run(self._last_exposure, exposure)
             turn = preintegrate(steps, state.gyro_bias if state else self._motion_start.gyro_bias, np.zeros(3)).dR
             if state is None:
-                part = preintegrate(steps, self._rotation_bias, np.zeros(3))
-                R, J, P = self._rotation
-                self._rotation = R @ part.dR, part.dR.T @ J + part.J[:3, :3], part.dR.T @ P @ part.dR + part.Q[:3, :3]
+                self._last_pose.rotate(steps)
                 slack = 2e-9 * self._motion_start.gyro_sigma * (exposure - self._last_exposure)
         self._last_exposure = exposure
         features = self.tracker.track(image, R_BC.T @ turn.T @ R_BC, slack)
@@ -224,10 +217,10 @@ class VisualInertialOdometry:
         steps = window(self._imu, exposure)
         if self._may_start_at_rest(steps):
             self._begin(start.at_rest(self.config, self.mount, exposure, steps,
-                                      self._known_pose_with_bias(steps[:, GYRO].mean(axis=0))))
+                                      self._last_pose.present(steps[:, GYRO].mean(axis=0))))
             return self._hold(exposure, features)
         self._motion_start.add(self._frame, exposure, features.ids, observe(self.mount.camera, features.pixels))
-        state = self._motion_start.solve(self._imu, self._known_pose_with_bias)
+        state = self._motion_start.solve(self._imu, self._last_pose.present)
         if state is not None:
             self._begin(state)
             self._at_configured_start, self._last_visual_update = False, exposure
@@ -253,26 +246,13 @@ class VisualInertialOdometry:
             return
         pose = pose_of(odometry)
         if pose.problem() is None:
-            self._known_pose = start.odometry_pose(pose)
-            self._known_at = pose.stamp, float(np.linalg.norm(odometry.v_B))
-            self._rotation_bias, self._at_configured_start = self._motion_start.gyro_bias, False
-            part = preintegrate(self._imu.run(pose.stamp, exposure), self._rotation_bias, np.zeros(3))
-            self._rotation = part.dR, part.J[:3, :3], part.Q[:3, :3]
-
-    def _known_pose_with_bias(self, gyro_bias: np.ndarray) -> KnownPose:
-        """Return the known present pose, with the heading propagated by the gyro less this bias."""
-        dR, J, P = self._rotation
-        return self._known_pose.turned(self._known_pose.R_WB @ dR @ so3.exp(J @ (gyro_bias - self._rotation_bias)), J, P)
+            self._last_pose.pose, self._at_configured_start = start.odometry_pose(pose), False
+            self._last_pose.known_at = pose.stamp, float(np.linalg.norm(odometry.v_B))
+            self._last_pose.begin_rotation(self._motion_start.gyro_bias)
+            self._last_pose.rotate(self._imu.run(pose.stamp, exposure))
 
     def _begin(self, state: at.State) -> None:
-        if self._known_at is not None:
-            since, speed = self._known_at
-            if since >= self._imu.oldest:
-                start.propagate_position(state, preintegrate(self._imu.run(since, state.stamp), state.gyro_bias, state.accel_bias))
-            else:  # its motion since then is unknown
-                reach = 1e-9 * (state.stamp - since) * max(speed, float(np.linalg.norm(state.v_WB)))
-                state.P[at.POSITION, at.POSITION] += reach**2 * np.eye(3)
-            self._known_at = None
+        self._last_pose.propagate_position(state, self._imu)
         self.filter = Msckf(self.config, state, self.mount.camera.fx)
         self._last_update = state.stamp
         self._odometry = None
@@ -375,7 +355,7 @@ class VisualInertialOdometry:
         self._store_pose()
         s = self._running.state
         speed = max(float(np.linalg.norm(s.v_WB)), least_speed)
-        self._known_at = s.stamp, speed if speed < SPEED_MAX else SPEED_MAX
+        self._last_pose.known_at = s.stamp, speed if speed < SPEED_MAX else SPEED_MAX
         self._begin_motion_start()
         self.filter, self._at_rest, self._at_configured_start, self.restarts = None, False, False, self.restarts + 1
 
@@ -383,7 +363,7 @@ class VisualInertialOdometry:
         """Store the pose and biases for a new start, unless they are not finite."""
         s = self._running.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
-            self._known_pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), start.positive(_estimate(s).pose_covariance[start.POSE_ROWS]))
+            self._last_pose.pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), start.positive(_estimate(s).pose_covariance[start.POSE_ROWS]))
             self._biases = _biases(s)
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport, now: at.State | None = None) -> VioResult:
