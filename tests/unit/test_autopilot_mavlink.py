@@ -325,6 +325,33 @@ def test_kill_stops_the_motors_also_where_no_controller_commands(autopilot):
     assert sent(Command.KILL, autopilot.now) == sent(Command.KILL, 0) == (400, 0.0, 21196.0)
 
 
+def test_kill_is_repeated_until_the_autopilot_is_disarmed_and_only_a_command_to_disarm_lets_it_arm_again(autopilot):
+    """Though its frame is lost, and a controller goes on commanding."""
+    m = autopilot.mavlink
+
+    def seconds(count: float, base_mode: int, armed: bool) -> list[tuple]:
+        """What the node orders, and (): that it sends a set point; once each in a row."""
+        sent: list[tuple] = []
+        for k in range(round(200 * count)):
+            if k % 50 == 0:
+                autopilot.say(m.heartbeat_encode(2, PX4, base_mode, OFFBOARD, 4))
+            autopilot.node.on_rates_thrust(RatesThrust(0, armed, (0.0, 0.0, 0.0), 9.81 * armed))
+            said = autopilot.heard()
+            sent += [()] * ("SET_ATTITUDE_TARGET" in said and armed)
+            sent += [(order.command, order.param1, order.param2)] if (order := said.get("COMMAND_LONG")) else []
+        return [order for order, before in zip(sent, [None, *sent]) if order or order != before]
+
+    autopilot.command_disarmed()
+    assert seconds(1.0, ARMED, True) == [()]
+    autopilot.node.on_command(ControllerCommand(0, Command.KILL, "a person's decision"))
+    autopilot.link.recv(1 << 20)                               # it is lost
+    assert seconds(3.0, ARMED, True) == [(400, 0.0, 21196.0)] * 3
+    assert "KILL was received" in autopilot.got["log"][-1].text
+    assert seconds(2.0, 0, True) == []
+    assert seconds(0.1, 0, False) == []
+    assert seconds(1.2, 0, True) == [(), (400, 1.0, 0.0), ()]
+
+
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
 def test_a_hosts_clock_that_jumps_is_one_line_and_everything_goes_on(autopilot):

@@ -41,6 +41,7 @@ class Offboard:
         forced: the autopilot was commanded with the motors on since it was last disarmed, so it must disarm also in flight.
         commanding: commands have come without a gap since the motors were commanded on, or since the autopilot was disarmed. Only then
             are commands with the motors off obeyed: a controller that was started again in flight is disarmed.
+        killed: KILL was received: the autopilot is disarmed, again and again, until it is and the commands have the motors off, too.
     """
 
     autopilot: int = 0
@@ -51,6 +52,7 @@ class Offboard:
     was_armed: bool = False
     forced: bool = False
     commanding: bool = False
+    killed: bool = False
     _last_heartbeat: float = -1e9
     _streaming_since: float | None = None
     _last_streaming: float = -1e9
@@ -80,6 +82,10 @@ class Offboard:
         """Return whether the last heartbeat is recent at a time [s]."""
         return 0.0 <= now - self._last_heartbeat < HEARTBEAT_TIMEOUT
 
+    def obeys(self, armed: bool) -> bool:
+        """Return whether the autopilot may be sent a command with the motors on (`armed`) or off."""
+        return not armed if self.killed else armed or not self.armed or self.commanding
+
     def next_request(self, now: float, wanted: bool, streaming: bool) -> Request:
         """Return the request to send at a time, at most one each `REQUEST_PERIOD` seconds.
 
@@ -100,9 +106,12 @@ class Offboard:
         continued = self.commanding and 0.0 <= now - self._last_streaming <= RESTART_GAP
         self.commanding = continued or streaming and (wanted or self.alive(now) and not self.armed)
         request = Request.NOTHING
-        if not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
+        if self.killed:
+            self.killed = self.armed or wanted or not (streaming and self.alive(now))
+            request = Request.DISARM if self.armed else request
+        elif not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
             return request
-        if not wanted:
+        elif not wanted:
             request = Request.DISARM if streaming and self.commanding and self.armed and self.following else request
             self.was_armed = self.was_armed and not streaming
             self.forced = self.forced and self.armed
