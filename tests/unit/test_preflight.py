@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import permutations, product
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,14 +10,16 @@ import pytest
 from perch_core.camera import PinholeCamera
 from perch_core.component import Diagnostics
 from perch_core.errors import PerchError
+from perch_core.ros.topics import topic
 from perch_core.urdf import fixed_frames
-from perch_core.values import CameraModel, ControllerStatus, ImuSample, MotorCommand, RotorState
+from perch_core.values import CameraModel, ControllerCommand, ControllerStatus, ImuSample, MotorCommand, RotorState
 from perch_core.vehicle import load_vehicle
 from perch_eval.preflight import checks, command
 from perch_eval.camera_turns import CameraTurns, rotation_between
 from perch_eval.preflight.checks import CommandResult, Verdict
 from perch_eval.preflight.ros import listener
 from scipy.spatial.transform import Rotation
+from unit.controller_flight import Flight
 
 VEHICLE = load_vehicle("snapdragon")
 PASSED, FAILED, OPEN = Verdict.PASSED, Verdict.FAILED, Verdict.OPEN
@@ -226,6 +229,24 @@ def test_the_watchdog_is_judged_by_motors_that_turned_until_the_last_command_and
     ends = Bench(monkeypatch, said).await_end_of_commands(60.0)
     assert checks.check_watchdog(*ends).verdict is snapdragon
     assert checks.check_watchdog(*ends, checks.DESCENT_TIME).verdict is autopilot
+
+
+def test_the_controller_obeys_though_odometry_has_stopped_and_the_imu_goes_on(monkeypatch):
+    """At the end of preflight, the motors would go on otherwise."""
+    flight, sent = Flight(), []
+    flight.step(0.1)
+    flight.component.on_command(ControllerCommand(0, command.Command.ARM, ""))
+    flight.step(0.1)
+    last = flight.odometry()
+    flight.step(2.0, odometry=False)
+    bench = Bench(monkeypatch, lambda t: [])
+    bench.values["odometry"].append((0.0, last))
+    bench.spin_until = lambda done, timeout: None
+    bench._command_publisher = SimpleNamespace(publish=sent.append)
+    bench.send_command(command.Command.KILL, command.State.FAILED)
+    assert flight.component.flight.state is command.State.ARMED
+    flight.component.on_command(topic("controller/command").to_value(sent[0]))
+    assert flight.component.flight.state is command.State.FAILED
 
 
 def test_another_vehicle_is_not_taken_for_this_one(monkeypatch):
