@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from perch_autopilot import firmware, frames, levelling, msp
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
 from perch_autopilot.configuration import Cli, CliError, differences, load_configuration
+from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.mavlink import Mavlink, MavlinkParameters
 from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rate_curve import RateCurve
@@ -246,6 +247,21 @@ def polled(node: Betaflight, start: float, count: int, thrust: float | None = No
 def test_a_pilot_who_has_not_handed_over_is_named_though_the_firmware_gives_no_reason(flown_on):
     said, = polled(flown_on(16.0), 100.0, 200, 9.81)
     assert said == "the autopilot refuses to arm: the pilot has not handed over: switch MSP OVERRIDE on"
+
+
+NONSENSE = RatesThrust(0, False, (np.nan,) * 3, np.nan)
+
+
+def test_a_command_with_the_motors_off_stops_them_whatever_else_it_says(flown_on):
+    node = flown_on(16.0)
+    node.on_rates_thrust(NONSENSE._replace(armed=True))
+    assert node._link.told == []
+    node.on_rates_thrust(NONSENSE)
+    assert node._link.told == [(False, CENTRED)]
+    loop = object.__new__(FirmwareLoop)
+    loop.sticks, loop.watchdog = node._sticks, watchdog()
+    loop.command(0, *NONSENSE[1:])
+    assert loop.watchdog.channels(0.0)[4] == OFF
 
 
 def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):

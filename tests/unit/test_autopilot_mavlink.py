@@ -159,6 +159,8 @@ def test_commands_leave_in_the_axes_of_aviation_and_never_stale(autopilot):
     assert "SET_ATTITUDE_TARGET" not in autopilot.heard(1.0)
     autopilot.node.on_rates_thrust(RatesThrust(0, True, (float("nan"), 0.0, 0.0), 9.81))
     assert "SET_ATTITUDE_TARGET" not in autopilot.heard() and "not finite" in autopilot.got["log"][-1].text
+    autopilot.node.on_rates_thrust(RatesThrust(0, False, (float("nan"), 0.0, 0.0), float("nan")))
+    assert autopilot.heard()["SET_ATTITUDE_TARGET"].thrust == 0.0
 
 
 def test_odometry_leaves_as_ned_with_its_covariance(autopilot):

@@ -111,7 +111,7 @@ class Betaflight(Component[BetaflightParameters]):
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Send a command to the autopilot; it is in effect until the next one, or until it is stale."""
         values = (*command.w_B, command.thrust)
-        if not sum(value * value for value in values) < 1e8:
+        if command.armed and not sum(value * value for value in values) < 1e8:
             self.warn(f"rates_thrust_command: {values} is not finite, or too large: ignored", min_interval=1.0)
             return
         self._arm_commanded = command.armed
