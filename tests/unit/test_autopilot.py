@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from perch_autopilot import firmware, frames, levelling, msp
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
-from perch_autopilot.configuration import Cli, CliError, differences, load_configuration
+from perch_autopilot.configuration import Cli, CliError, Configuration, differences, load_configuration
 from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.mavlink import Mavlink, MavlinkParameters
 from perch_autopilot.supervised_link import SupervisedLink
@@ -563,6 +563,21 @@ def test_a_command_line_that_does_not_answer_is_one_line(came, words, monkeypatc
     with pytest.raises(CliError, match=words) as error:
         Cli(lambda data: None, lambda timeout: came)
     assert len(str(error.value)) < 160
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 64])
+def test_a_dump_is_read_to_its_end_in_whatever_pieces_it_arrives(size):
+    """Its comments begin like the prompt."""
+    dump, pending = b"dump\r\n\r\n# version\r\n# feature\r\nset p_roll = 180\r\n\r\n# ", bytearray(b"#\r\n# ")
+
+    def receive(_: float) -> bytes:
+        piece = bytes(pending[:size])
+        del pending[:size]
+        return piece
+
+    cli = Cli(lambda data: pending.extend(dump * data.startswith(b"dump")), receive)
+    cli.check(Configuration("mine.txt", ("set p_roll = 180",)))
+    assert not pending
 
 
 def test_rates_of_another_type_are_refused():
