@@ -8,6 +8,7 @@ import select
 import signal
 import socket
 import struct
+import termios
 import time
 from collections.abc import Iterator
 
@@ -22,7 +23,8 @@ CURVES = (RateCurve(400, 900, 0.0), RateCurve(400, 900, 0.3))
 STICKS = (1500, 1500, 1500, 1500)
 
 
-@pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999"])
+@pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999", "tcp:a..b:1",
+                                     "/dev/no\0device"])
 def test_a_wire_that_is_none_is_one_line(address):
     with pytest.raises(LinkError, match=address.replace("[", ".")) as error:
         Link(address)
@@ -46,6 +48,23 @@ def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
             link.read(1.0)
     finally:
         link.close()
+
+
+def test_a_port_is_set_up_whatever_its_last_user_has_left():
+    """Without flow control above all: an autopilot that gives no clear-to-send would never be spoken to."""
+    ours, theirs = pty.openpty()
+    mode = termios.tcgetattr(theirs)
+    mode[0] |= termios.IXON | termios.IXOFF | termios.IGNCR | termios.INLCR
+    mode[2] = mode[2] & ~termios.CLOCAL | termios.CRTSCTS | termios.CSTOPB
+    mode[6][termios.VMIN] = 0
+    termios.tcsetattr(theirs, termios.TCSANOW, mode)
+    link = Link(os.ttyname(theirs) + "@921600")
+    iflag, oflag, cflag, lflag, _, speed, characters = termios.tcgetattr(theirs)
+    assert (iflag, oflag, lflag, speed, characters[termios.VMIN]) == (0, 0, 0, termios.B921600, 1)
+    assert cflag & termios.CLOCAL and cflag & termios.CREAD and not cflag & (termios.CRTSCTS | termios.CSTOPB)
+    link.close()
+    os.close(theirs)
+    os.close(ours)
 
 
 def test_a_full_port_gets_whole_frames_or_none():
