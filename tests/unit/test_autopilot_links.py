@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import select
@@ -11,12 +12,13 @@ import struct
 import termios
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 from perch_autopilot import msp
-from perch_autopilot.supervised_link import SupervisedLink
+from perch_autopilot.supervised_link import COMMAND, LinkSupervisor, SupervisedLink
 from perch_autopilot.rate_curve import RateCurve
-from perch_autopilot.watchdog import OFF, ON
+from perch_autopilot.watchdog import OFF, ON, Watchdog
 from perch_autopilot.link import Link, LinkError
 
 CURVES = (RateCurve(400, 900, 0.0), RateCurve(400, 900, 0.3))
@@ -133,6 +135,37 @@ def test_a_supervisor_whose_link_is_lost_ends_when_the_autopilot_has_been_disarm
             peer.settimeout(120.0)
             assert peer.recv(4096).startswith(msp.channels((1500, 1500, 1000, 1500, OFF, OFF)))
             assert link.process.wait(120.0) == 0
+
+
+def test_a_supervisor_tells_its_mode_again_when_a_lost_link_is_back():
+    """The end of the link would be what the node reports, and why it does not arm, for the rest of the flight otherwise."""
+    node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    now, said = 0.0, []
+    with socket.create_server(("127.0.0.1", 0)) as server, node, theirs:
+        supervisor = LinkSupervisor(f"tcp:127.0.0.1:{server.getsockname()[1]}", theirs, Watchdog(1450, 1420), lambda: now)
+        server.accept()[0].close()
+        for now in (0.01, 0.02, 0.3, 0.31):  # noqa: B007  by the clock
+            node.send(b"C" + COMMAND.pack(True, *STICKS))
+            supervisor.work(1.0)
+            supervisor.work(0.0)
+        node.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:
+                said.append(node.recv(100)[1:].decode())
+        assert len([line for line in said if "has ended" in line]) == 1 and said[-1] == "following"
+        supervisor._link.close()
+
+
+def test_a_process_for_the_link_that_cannot_be_started_is_one_line(monkeypatch):
+    """It is started in flight, too, where the one before was ended for want of memory."""
+    def refused(*_, **__):
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    monkeypatch.setattr("subprocess.Popen", refused)
+    files = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(LinkError, match="/dev/x: the process that holds the link cannot be started: Cannot allocate memory$"):
+        SupervisedLink("/dev/x", 1450, 1420, 4.0, CURVES)
+    assert len(os.listdir("/proc/self/fd")) == files
 
 
 @pytest.fixture(params=["serial", "tcp"])
