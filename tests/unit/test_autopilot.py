@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import pty
 import select
+import socket
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from perch_autopilot import firmware, frames, levelling, msp
+from perch_autopilot import firmware, frames, levelling, msp, sitl
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
 from perch_autopilot.configuration import Cli, CliError, Configuration, differences, load_configuration
 from perch_autopilot.loop import FirmwareLoop
@@ -578,6 +580,19 @@ def test_a_dump_is_read_to_its_end_in_whatever_pieces_it_arrives(size):
     cli = Cli(lambda data: pending.extend(dump * data.startswith(b"dump")), receive)
     cli.check(Configuration("mine.txt", ("set p_roll = 180",)))
     assert not pending
+
+
+def test_a_firmware_in_the_loop_that_ends_is_named_at_once():
+    ours, theirs = socket.socketpair()
+    running = sitl.Sitl.__new__(sitl.Sitl)
+    running._running = SimpleNamespace(stream=ours)
+    with ours:
+        assert running.receive(0.0) == running.receive(0.001) == b""
+        theirs.close()
+        with pytest.raises(firmware.FirmwareError, match="firmware has ended"):
+            running.receive(60.0)
+        with pytest.raises(firmware.FirmwareError, match="cannot be sent anything: Broken pipe"):
+            running.send(b"#")
 
 
 def test_rates_of_another_type_are_refused():
