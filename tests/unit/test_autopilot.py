@@ -266,6 +266,24 @@ def test_a_command_with_the_motors_off_stops_them_whatever_else_it_says(flown_on
     assert loop.watchdog.channels(0.0)[4] == OFF
 
 
+def test_who_disarms_the_autopilot_is_obeyed_until_the_commands_have_the_motors_off(flown_on, monkeypatch):
+    """A restarted autopilot would arm by itself otherwise; of a report that is corrupt, and alone, nothing follows."""
+    node = flown_on(16.0)
+    monkeypatch.setattr(StubAutopilot, "armed", True)
+    assert polled(node, 1.0, 100, 9.81) == []
+    node._handle_frame(msp.Frame(msp.STATUS, struct.pack("<HHHIBHBBBBIB", *(0,) * 9, 29, 0, 0), False), 0)
+    assert polled(node, 2.0, 100, 9.81) == [] and "kill" not in node._link.told
+    monkeypatch.setattr(StubAutopilot, "armed", False)
+    said, = polled(node, 3.0, 33, 9.81)
+    assert said.startswith("the autopilot was disarmed by its pilot") and node._link.told.count("kill") == 1
+    polled(node, 3.33, 300, 9.81)
+    node.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
+    polled(node, 7.0, 100, 9.81)
+    monkeypatch.setattr(StubAutopilot, "armed", True)
+    polled(node, 8.0, 100, 9.81)
+    assert node._link.told.count("kill") == 1
+
+
 def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):
     node, reports, samples = flown_on(16.0), [], []
     node.diagnostics.receivers.append(reports.append)
