@@ -108,6 +108,14 @@ def test_a_gyroscope_with_another_scale_or_another_motion_is_found(felt, words):
     assert check.verdict is FAILED and words in check.observation
 
 
+def test_rates_that_are_no_numbers_are_found():
+    rates = np.random.default_rng(6).standard_normal((60, 3))
+    rates[7, 1] = np.nan
+    check = checks.check_rotation("down", rates, rates @ VEHICLE.mounts["down"].R_BC, VEHICLE)
+    assert check.verdict is FAILED and "not finite" in check.observation
+    assert verdicts(checks.check_at_rest(still(spin=np.nan)))["gyroscope at rest"] is FAILED
+
+
 def test_shaking_too_little_is_no_verdict():
     rates = np.outer(np.sin(np.arange(60)), (1.0, 0.0, 0.0))  # about one axis alone
     assert checks.check_rotation("down", rates, rates, VEHICLE).verdict is OPEN
@@ -180,7 +188,7 @@ def test_motors_start_only_where_the_propellers_are_off():
 def test_who_does_not_arm_fails_and_is_not_tried_further():
     graph = Graph(obeys=False)
     seen = verdicts(command.active_checks(graph, ALL))
-    assert seen["armed state"] is FAILED and seen["watchdog"] is seen["pilot's takeover"] is OPEN
+    assert seen["armed state"] is FAILED and seen["kill"] is seen["watchdog"] is seen["pilot's takeover"] is OPEN
     sent = command.Command
     assert graph.commands == [sent.ARM, sent.DISARM, sent.ARM, sent.KILL, sent.DISARM]
 
