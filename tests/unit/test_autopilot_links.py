@@ -143,16 +143,17 @@ def test_a_supervisor_tells_its_mode_again_when_a_lost_link_is_back():
     now, said = 0.0, []
     with socket.create_server(("127.0.0.1", 0)) as server, node, theirs:
         supervisor = LinkSupervisor(f"tcp:127.0.0.1:{server.getsockname()[1]}", theirs, Watchdog(1450, 1420), lambda: now)
-        server.accept()[0].close()
-        for now in (0.01, 0.02, 0.3, 0.31):  # noqa: B007  by the clock
-            node.send(b"C" + COMMAND.pack(True, *STICKS))
-            supervisor.work(1.0)
-            supervisor.work(0.0)
+        peer = server.accept()[0]
         node.setblocking(False)
-        with suppress(BlockingIOError):
-            while True:
-                said.append(node.recv(100)[1:].decode())
-        assert len([line for line in said if "has ended" in line]) == 1 and said[-1] == "following"
+        for now in (0.01, 0.02, 0.3):
+            node.send(b"C" + COMMAND.pack(True, *STICKS))
+            for _ in range(3):
+                supervisor.work(0.1)
+            with suppress(BlockingIOError):
+                while True:
+                    said.append(node.recv(100)[1:].decode().split(":")[0])
+            peer.close()
+        assert said == ["following", "the link to the autopilot has ended", "following"]
         supervisor._link.close()
 
 
