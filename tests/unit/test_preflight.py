@@ -1,5 +1,8 @@
 """Preflight: what is sound passes, every wrong axis, rate, stamp, clock and unit is named, and nothing is exercised unasked."""
 
+import os
+import signal
+from contextlib import closing
 from dataclasses import replace
 from itertools import permutations, product
 from types import SimpleNamespace
@@ -14,6 +17,7 @@ from perch_core.ros.topics import topic
 from perch_core.urdf import fixed_frames
 from perch_core.values import CameraModel, ControllerCommand, ControllerStatus, ImuSample, MotorCommand, RotorState
 from perch_core.vehicle import load_vehicle
+from perch_eval.domain import reserved_domain
 from perch_eval.preflight import checks, command
 from perch_eval.camera_turns import CameraTurns, rotation_between
 from perch_eval.preflight.checks import CommandResult, Verdict
@@ -287,6 +291,18 @@ def test_a_check_that_is_interrupted_leaves_the_motors_off(wait, error):
     with pytest.raises(error):
         command.active_checks(graph, ALL)
     assert graph.commands[-3:] == [command.Command.ARM, command.Command.KILL, command.Command.DISARM]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_terminal_that_is_closed_is_an_interrupt_too(number, monkeypatch):
+    """As of a lost connection to the companion computer: preflight ends, and the motors with it."""
+    before = signal.getsignal(number)
+    with reserved_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        with closing(listener.GraphListener(VEHICLE)) as graph, pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+            graph.spin_for(60.0)
+    assert signal.getsignal(number) is before
 
 
 def test_an_autopilot_may_descend_before_its_motors_stop():

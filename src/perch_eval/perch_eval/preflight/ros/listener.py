@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Sequence
 from copy import copy
@@ -52,7 +53,7 @@ class GraphListener(GraphNode):
     """
 
     def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
-        super().__init__("preflight", in_namespace(namespace))
+        super().__init__("preflight", in_namespace(namespace), (signal.SIGINT, signal.SIGTERM, signal.SIGHUP))  # none leaves it armed
         self.values: dict[str, list[tuple[float, Any]]] = {channel: [] for channel in CHANNELS}
         self.turns: CameraTurns | None = None
         self._speed_max, self._namespace = vehicle.speed_max, namespace.strip("/")
