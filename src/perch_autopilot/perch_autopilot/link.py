@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
@@ -48,6 +49,8 @@ class Link:
             else:
                 self.file = _opened_port(address)
             os.set_blocking(self.file, False)
+        except LinkError:
+            raise
         except (OSError, OverflowError, ValueError) as error:  # ValueError: a name that no host or file can have
             raise LinkError(f"{address}: cannot be opened: {getattr(error, 'strerror', None) or error}") from None
 
@@ -107,8 +110,10 @@ def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socke
     lock = socket.socket(socket.AF_UNIX)
     try:
         lock.bind(f"\0perch_autopilot {address}")
-    except OSError:
+    except OSError as error:
         lock.close()
+        if error.errno != errno.EADDRINUSE:  # its name is too long
+            raise
         raise PortTaken(f"{address}: {_TAKEN}") from None
     try:
         connection = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
