@@ -350,8 +350,18 @@ def test_kill_is_repeated_until_the_autopilot_is_disarmed_and_only_a_command_to_
     assert seconds(3.0, ARMED, True) == [(400, 0.0, 21196.0)] * 3
     assert "KILL was received" in autopilot.got["log"][-1].text
     assert seconds(2.0, 0, True) == []
+    assert seconds(2.0, ARMED, True) == []                     # its pilot has armed it: this is not what was killed
     assert seconds(0.1, 0, False) == []
     assert seconds(1.2, 0, True) == [(), (400, 1.0, 0.0), ()]
+
+
+def test_kill_is_not_repeated_for_long_nor_by_a_clock_that_jumps():
+    for jump, count in ((0.0, 5), (-3600.0, 0)):
+        machine = Offboard(autopilot=PX4, armed=True, following=True)
+        machine.kill(10.0)
+        if jump:
+            machine.set_time(10.0 + jump)
+        assert asked(machine, 20.0, start=10.0 + jump) == [Request.DISARM] * count
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------

@@ -136,7 +136,8 @@ class Mavlink(Component[MavlinkParameters]):
     def on_command(self, command: ControllerCommand) -> None:
         """Stop the motors on KILL in any mode and at any height, also where no controller is there to obey it, or a frame is lost."""
         if command.command == Command.KILL and not 0 < command.stamp < (self._now or 0) - STALE:
-            self._command, self.offboard.killed = None, True
+            self._command = None
+            self.offboard.kill((self._now or 0) * 1e-9)
             self._send_command(_ARM_DISARM, 0.0, _FORCED)
 
     def on_odometry(self, state: OdometryState) -> None:
@@ -223,7 +224,8 @@ class Mavlink(Component[MavlinkParameters]):
         self.close()
         before = self.offboard
         self.offboard = Offboard(before.autopilot, options=before.options, angle_boost=before.angle_boost, was_armed=before.was_armed,
-                                 forced=before.forced, commanding=before.commanding, killed=before.killed)
+                                 forced=before.forced, commanding=before.commanding, killed=before.killed,
+                                 _disarm_until=before._disarm_until)
         self._clock, self._last_sample = ClockOffset(), None
 
     def _send_command(self, command: int, *words: float) -> None:
