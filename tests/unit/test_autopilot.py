@@ -5,16 +5,19 @@ from __future__ import annotations
 import os
 import pty
 import select
+import socket
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from perch_autopilot import firmware, frames, levelling, msp
+from perch_autopilot import firmware, frames, levelling, msp, sitl
 from perch_autopilot.betaflight import Betaflight, BetaflightParameters
-from perch_autopilot.configuration import Cli, CliError, differences, load_configuration
+from perch_autopilot.configuration import Cli, CliError, Configuration, differences, load_configuration
+from perch_autopilot.loop import FirmwareLoop
 from perch_autopilot.mavlink import Mavlink, MavlinkParameters
 from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rate_curve import RateCurve
@@ -246,6 +249,39 @@ def polled(node: Betaflight, start: float, count: int, thrust: float | None = No
 def test_a_pilot_who_has_not_handed_over_is_named_though_the_firmware_gives_no_reason(flown_on):
     said, = polled(flown_on(16.0), 100.0, 200, 9.81)
     assert said == "the autopilot refuses to arm: the pilot has not handed over: switch MSP OVERRIDE on"
+
+
+NONSENSE = RatesThrust(0, False, (np.nan,) * 3, np.nan)
+
+
+def test_a_command_with_the_motors_off_stops_them_whatever_else_it_says(flown_on):
+    node = flown_on(16.0)
+    node.on_rates_thrust(NONSENSE._replace(armed=True))
+    assert node._link.told == []
+    node.on_rates_thrust(NONSENSE)
+    assert node._link.told == [(False, CENTRED)]
+    loop = object.__new__(FirmwareLoop)
+    loop.sticks, loop.watchdog = node._sticks, watchdog()
+    loop.command(0, *NONSENSE[1:])
+    assert loop.watchdog.channels(0.0)[4] == OFF
+
+
+def test_who_disarms_the_autopilot_is_obeyed_until_the_commands_have_the_motors_off(flown_on, monkeypatch):
+    """A restarted autopilot would arm by itself otherwise; of a report that is corrupt, and alone, nothing follows."""
+    node = flown_on(16.0)
+    monkeypatch.setattr(StubAutopilot, "armed", True)
+    assert polled(node, 1.0, 100, 9.81) == []
+    node._handle_frame(msp.Frame(msp.STATUS, struct.pack("<HHHIBHBBBBIB", *(0,) * 9, 29, 0, 0), False), 0)
+    assert polled(node, 2.0, 100, 9.81) == [] and "kill" not in node._link.told
+    monkeypatch.setattr(StubAutopilot, "armed", False)
+    said, = polled(node, 3.0, 33, 9.81)
+    assert said.startswith("the autopilot was disarmed by its pilot") and node._link.told.count("kill") == 1
+    polled(node, 3.33, 300, 9.81)
+    node.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
+    polled(node, 7.0, 100, 9.81)
+    monkeypatch.setattr(StubAutopilot, "armed", True)
+    polled(node, 8.0, 100, 9.81)
+    assert node._link.told.count("kill") == 1
 
 
 def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):
@@ -547,6 +583,34 @@ def test_a_command_line_that_does_not_answer_is_one_line(came, words, monkeypatc
     with pytest.raises(CliError, match=words) as error:
         Cli(lambda data: None, lambda timeout: came)
     assert len(str(error.value)) < 160
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 64])
+def test_a_dump_is_read_to_its_end_in_whatever_pieces_it_arrives(size):
+    """Its comments begin like the prompt."""
+    dump, pending = b"dump\r\n\r\n# version\r\n# feature\r\nset p_roll = 180\r\n\r\n# ", bytearray(b"#\r\n# ")
+
+    def receive(_: float) -> bytes:
+        piece = bytes(pending[:size])
+        del pending[:size]
+        return piece
+
+    cli = Cli(lambda data: pending.extend(dump * data.startswith(b"dump")), receive)
+    cli.check(Configuration("mine.txt", ("set p_roll = 180",)))
+    assert not pending
+
+
+def test_a_firmware_in_the_loop_that_ends_is_named_at_once():
+    ours, theirs = socket.socketpair()
+    running = sitl.Sitl.__new__(sitl.Sitl)
+    running._running = SimpleNamespace(stream=ours)
+    with ours:
+        assert running.receive(0.0) == running.receive(0.001) == b""
+        theirs.close()
+        with pytest.raises(firmware.FirmwareError, match="firmware has ended"):
+            running.receive(60.0)
+        with pytest.raises(firmware.FirmwareError, match="cannot be sent anything: Broken pipe"):
+            running.send(b"#")
 
 
 def test_rates_of_another_type_are_refused():

@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import select
 import signal
 import socket
 import struct
+import termios
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 from perch_autopilot import msp
-from perch_autopilot.supervised_link import SupervisedLink
+from perch_autopilot.supervised_link import COMMAND, LinkSupervisor, SupervisedLink
 from perch_autopilot.rate_curve import RateCurve
-from perch_autopilot.watchdog import OFF, ON
-from perch_autopilot.link import Link, LinkError
+from perch_autopilot.watchdog import OFF, ON, Watchdog
+from perch_autopilot.link import Link, LinkError, PortTaken
 
 CURVES = (RateCurve(400, 900, 0.0), RateCurve(400, 900, 0.3))
 STICKS = (1500, 1500, 1500, 1500)
 
 
-@pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999"])
+@pytest.mark.parametrize("address", ["/dev/no_such_device", "/dev/null", "tcp:127.0.0.1:1", "/dev/ptmx@12345", "tcp:127.0.0.1:99999", "tcp:a..b:1",
+                                     "/dev/no\0device", f"tcp:{100 * 'a'}:1"])
 def test_a_wire_that_is_none_is_one_line(address):
     with pytest.raises(LinkError, match=address.replace("[", ".")) as error:
         Link(address)
-    assert "\n" not in str(error.value)
+    assert "\n" not in str(error.value) and "another process" not in str(error.value)
 
 
 def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
@@ -46,6 +50,23 @@ def test_a_serial_line_carries_bytes_and_its_end_is_an_error():
             link.read(1.0)
     finally:
         link.close()
+
+
+def test_a_port_is_set_up_whatever_its_last_user_has_left():
+    """Without flow control above all: an autopilot that gives no clear-to-send would never be spoken to."""
+    ours, theirs = pty.openpty()
+    mode = termios.tcgetattr(theirs)
+    mode[0] |= termios.IXON | termios.IXOFF | termios.IGNCR | termios.INLCR
+    mode[2] = mode[2] & ~termios.CLOCAL | termios.CRTSCTS | termios.CSTOPB
+    mode[6][termios.VMIN] = 0
+    termios.tcsetattr(theirs, termios.TCSANOW, mode)
+    link = Link(os.ttyname(theirs) + "@921600")
+    iflag, oflag, cflag, lflag, _, speed, characters = termios.tcgetattr(theirs)
+    assert (iflag, oflag, lflag, speed, characters[termios.VMIN]) == (0, 0, 0, termios.B921600, 1)
+    assert cflag & termios.CLOCAL and cflag & termios.CREAD and not cflag & (termios.CRTSCTS | termios.CSTOPB)
+    link.close()
+    os.close(theirs)
+    os.close(ours)
 
 
 def test_a_full_port_gets_whole_frames_or_none():
@@ -116,6 +137,38 @@ def test_a_supervisor_whose_link_is_lost_ends_when_the_autopilot_has_been_disarm
             assert link.process.wait(120.0) == 0
 
 
+def test_a_supervisor_tells_its_mode_again_when_a_lost_link_is_back():
+    """The end of the link would be what the node reports, and why it does not arm, for the rest of the flight otherwise."""
+    node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    now, said = 0.0, []
+    with socket.create_server(("127.0.0.1", 0)) as server, node, theirs:
+        supervisor = LinkSupervisor(f"tcp:127.0.0.1:{server.getsockname()[1]}", theirs, Watchdog(1450, 1420), lambda: now)
+        peer = server.accept()[0]
+        node.setblocking(False)
+        for now in (0.01, 0.02, 0.3):
+            node.send(b"C" + COMMAND.pack(True, *STICKS))
+            for _ in range(3):
+                supervisor.work(0.1)
+            with suppress(BlockingIOError):
+                while True:
+                    said.append(node.recv(100)[1:].decode().split(":")[0])
+            peer.close()
+        assert said == ["following", "the link to the autopilot has ended", "following"]
+        supervisor._link.close()
+
+
+def test_a_process_for_the_link_that_cannot_be_started_is_one_line(monkeypatch):
+    """It is started in flight, too, where the one before was ended for want of memory."""
+    def refused(*_, **__):
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    monkeypatch.setattr("subprocess.Popen", refused)
+    files = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(LinkError, match="/dev/x: the process that holds the link cannot be started: Cannot allocate memory$"):
+        SupervisedLink("/dev/x", 1450, 1420, 4.0, CURVES)
+    assert len(os.listdir("/proc/self/fd")) == files
+
+
 @pytest.fixture(params=["serial", "tcp"])
 def address(request) -> Iterator[str]:
     """A serial port, or one by TCP."""
@@ -132,7 +185,7 @@ def address(request) -> Iterator[str]:
 def test_a_port_belongs_to_one_process_at_a_time(address):
     first = Link(address)
     for _ in range(2):
-        with pytest.raises(LinkError, match=f"{address}: another process has this port"):
+        with pytest.raises(PortTaken, match=f"^{address}: another process has this port"):
             Link(address)
     first.close()
     Link(address).close()
@@ -142,7 +195,7 @@ def test_a_port_that_cannot_be_set_up_is_not_left_open():
     ours, theirs = pty.openpty()
     files = len(os.listdir("/proc/self/fd"))
     for _ in range(3):
-        with pytest.raises(LinkError, match="12345 is not a baud rate"):
+        with pytest.raises(LinkError, match="@12345: 12345 is not a baud rate"):
             Link(f"{os.ttyname(theirs)}@12345")
         with pytest.raises(LinkError, match="cannot be opened"):
             Link("tcp:127.0.0.1:1")

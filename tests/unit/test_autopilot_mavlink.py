@@ -159,6 +159,8 @@ def test_commands_leave_in_the_axes_of_aviation_and_never_stale(autopilot):
     assert "SET_ATTITUDE_TARGET" not in autopilot.heard(1.0)
     autopilot.node.on_rates_thrust(RatesThrust(0, True, (float("nan"), 0.0, 0.0), 9.81))
     assert "SET_ATTITUDE_TARGET" not in autopilot.heard() and "not finite" in autopilot.got["log"][-1].text
+    autopilot.node.on_rates_thrust(RatesThrust(0, False, (float("nan"), 0.0, 0.0), float("nan")))
+    assert autopilot.heard()["SET_ATTITUDE_TARGET"].thrust == 0.0
 
 
 def test_odometry_leaves_as_ned_with_its_covariance(autopilot):
@@ -323,6 +325,43 @@ def test_kill_stops_the_motors_also_where_no_controller_commands(autopilot):
     assert sent(Command.LAND, autopilot.now) is None
     assert sent(Command.KILL, autopilot.now - 2 * SECOND) is None
     assert sent(Command.KILL, autopilot.now) == sent(Command.KILL, 0) == (400, 0.0, 21196.0)
+
+
+def test_kill_is_repeated_until_the_autopilot_is_disarmed_and_only_a_command_to_disarm_lets_it_arm_again(autopilot):
+    """Though its frame is lost, and a controller goes on commanding."""
+    m = autopilot.mavlink
+
+    def seconds(count: float, base_mode: int, armed: bool) -> list[tuple]:
+        """What the node orders, and (): that it sends a set point; once each in a row."""
+        sent: list[tuple] = []
+        for k in range(round(200 * count)):
+            if k % 50 == 0:
+                autopilot.say(m.heartbeat_encode(2, PX4, base_mode, OFFBOARD, 4))
+            autopilot.node.on_rates_thrust(RatesThrust(0, armed, (0.0, 0.0, 0.0), 9.81 * armed))
+            said = autopilot.heard()
+            sent += [()] * ("SET_ATTITUDE_TARGET" in said and armed)
+            sent += [(order.command, order.param1, order.param2)] if (order := said.get("COMMAND_LONG")) else []
+        return [order for order, before in zip(sent, [None, *sent]) if order or order != before]
+
+    autopilot.command_disarmed()
+    assert seconds(1.0, ARMED, True) == [()]
+    autopilot.node.on_command(ControllerCommand(0, Command.KILL, "a person's decision"))
+    autopilot.link.recv(1 << 20)                               # it is lost
+    assert seconds(3.0, ARMED, True) == [(400, 0.0, 21196.0)] * 3
+    assert "KILL was received" in autopilot.got["log"][-1].text
+    assert seconds(2.0, 0, True) == []
+    assert seconds(2.0, ARMED, True) == []                     # its pilot has armed it: this is not what was killed
+    assert seconds(0.1, 0, False) == []
+    assert seconds(1.2, 0, True) == [(), (400, 1.0, 0.0), ()]
+
+
+def test_kill_is_not_repeated_for_long_nor_by_a_clock_that_jumps():
+    for jump, count in ((0.0, 5), (-3600.0, 0)):
+        machine = Offboard(autopilot=PX4, armed=True, following=True)
+        machine.kill(10.0)
+        if jump:
+            machine.set_time(10.0 + jump)
+        assert asked(machine, 20.0, start=10.0 + jump) == [Request.DISARM] * count
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------

@@ -318,8 +318,15 @@ def test_a_firmware_that_will_arm_when_the_pilot_has_moved_his_stick_is_waited_f
 def test_a_command_ends_the_command_line_in_which_an_autopilot_does_not_fly(line, code, monkeypatch, tmp_path):
     sent, file = [], tmp_path / "mine.txt"
     file.write_text(line + "\n")
-    monkeypatch.setattr(command, "Link", lambda address: SimpleNamespace(write=sent.append, read=lambda timeout: b"set p_roll = 180\r\n# "))
+
+    def answered(answer: bytes) -> None:
+        """What is written to the port has this answer, once."""
+        pending: list[bytes] = []
+        port = SimpleNamespace(write=lambda data: (sent.append(data), pending.append(answer)), read=lambda _: pending.pop() if pending else b"")
+        monkeypatch.setattr(command, "Link", lambda address: port)
+
+    answered(b"set p_roll = 180\r\n# ")
     assert command.main(["check", "/dev/null", str(file)]) == code and sent[-1] == b"exit\r\n"
     assert command.main(["configure", "/dev/null", str(file)]) == 0 and sent[-1] == b"save\r\n"
-    monkeypatch.setattr(command, "Link", lambda address: SimpleNamespace(write=sent.append, read=lambda timeout: b"###ERROR\r\n# "))
+    answered(b"###ERROR\r\n# ")
     assert command.main(["configure", "/dev/null", str(file)]) == 2 and sent[-1] == b"exit\r\n"

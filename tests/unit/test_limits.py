@@ -11,7 +11,8 @@ from perch_core.component import Component, Input
 from perch_core.errors import ConfigError
 from perch_core.ros import topics
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
-from perch_core.values import ImuSample, MappedPowerline, MotorCommand, OdometryState, PerchGoal, PowerlineMap, TrajectoryOrder, limits
+from perch_core.values import (
+    AttitudeThrust, ImuSample, MappedPowerline, MotorCommand, OdometryState, PerchGoal, PowerlineMap, RatesThrust, TrajectoryOrder, limits)
 from perch_eval.limits_page import page
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,6 +38,12 @@ UNEVEN = np.eye(3) + np.triu(np.ones((3, 3)), 1)
     ("a value without limits", "")])
 def test_a_value_is_refused_with_field_value_and_range(value, said):
     assert limits.problem(value).startswith(said) and bool(limits.problem(value)) == bool(said)
+
+
+@pytest.mark.parametrize("command", [MotorCommand(0, True, (nan,) * 4), RatesThrust(0, True, (0.0, nan, 0.0), 9.81),
+                                     AttitudeThrust(0, True, (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, nan)])
+def test_motors_stop_whatever_else_a_command_says(command):
+    assert limits.problem(command) and not limits.problem(command._replace(armed=False))
 
 
 def test_a_request_is_refused_with_its_source():

@@ -1,7 +1,11 @@
 """Preflight: what is sound passes, every wrong axis, rate, stamp, clock and unit is named, and nothing is exercised unasked."""
 
+import os
+import signal
+from contextlib import closing
 from dataclasses import replace
 from itertools import permutations, product
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,14 +13,17 @@ import pytest
 from perch_core.camera import PinholeCamera
 from perch_core.component import Diagnostics
 from perch_core.errors import PerchError
+from perch_core.ros.topics import topic
 from perch_core.urdf import fixed_frames
-from perch_core.values import CameraModel, ControllerStatus, ImuSample, MotorCommand, RotorState
+from perch_core.values import CameraModel, ControllerCommand, ControllerStatus, ImuSample, MotorCommand, RotorState
 from perch_core.vehicle import load_vehicle
+from perch_eval.domain import reserved_domain
 from perch_eval.preflight import checks, command
 from perch_eval.camera_turns import CameraTurns, rotation_between
 from perch_eval.preflight.checks import CommandResult, Verdict
 from perch_eval.preflight.ros import listener
 from scipy.spatial.transform import Rotation
+from unit.controller_flight import Flight
 
 VEHICLE = load_vehicle("snapdragon")
 PASSED, FAILED, OPEN = Verdict.PASSED, Verdict.FAILED, Verdict.OPEN
@@ -105,6 +112,14 @@ def test_a_gyroscope_with_another_scale_or_another_motion_is_found(felt, words):
     assert check.verdict is FAILED and words in check.observation
 
 
+def test_rates_that_are_no_numbers_are_found():
+    rates = np.random.default_rng(6).standard_normal((60, 3))
+    rates[7, 1] = np.nan
+    check = checks.check_rotation("down", rates, rates @ VEHICLE.mounts["down"].R_BC, VEHICLE)
+    assert check.verdict is FAILED and "not finite" in check.observation
+    assert verdicts(checks.check_at_rest(still(spin=np.nan)))["gyroscope at rest"] is FAILED
+
+
 def test_shaking_too_little_is_no_verdict():
     rates = np.outer(np.sin(np.arange(60)), (1.0, 0.0, 0.0))  # about one axis alone
     assert checks.check_rotation("down", rates, rates, VEHICLE).verdict is OPEN
@@ -177,7 +192,7 @@ def test_motors_start_only_where_the_propellers_are_off():
 def test_who_does_not_arm_fails_and_is_not_tried_further():
     graph = Graph(obeys=False)
     seen = verdicts(command.active_checks(graph, ALL))
-    assert seen["armed state"] is FAILED and seen["watchdog"] is seen["pilot's takeover"] is OPEN
+    assert seen["armed state"] is FAILED and seen["kill"] is seen["watchdog"] is seen["pilot's takeover"] is OPEN
     sent = command.Command
     assert graph.commands == [sent.ARM, sent.DISARM, sent.ARM, sent.KILL, sent.DISARM]
 
@@ -228,6 +243,24 @@ def test_the_watchdog_is_judged_by_motors_that_turned_until_the_last_command_and
     assert checks.check_watchdog(*ends, checks.DESCENT_TIME).verdict is autopilot
 
 
+def test_the_controller_obeys_though_odometry_has_stopped_and_the_imu_goes_on(monkeypatch):
+    """At the end of preflight, the motors would go on otherwise."""
+    flight, sent = Flight(), []
+    flight.step(0.1)
+    flight.component.on_command(ControllerCommand(0, command.Command.ARM, ""))
+    flight.step(0.1)
+    last = flight.odometry()
+    flight.step(2.0, odometry=False)
+    bench = Bench(monkeypatch, lambda t: [])
+    bench.values["odometry"].append((0.0, last))
+    bench.spin_until = lambda done, timeout: None
+    bench._command_publisher = SimpleNamespace(publish=sent.append)
+    bench.send_command(command.Command.KILL, command.State.FAILED)
+    assert flight.component.flight.state is command.State.ARMED
+    flight.component.on_command(topic("controller/command").to_value(sent[0]))
+    assert flight.component.flight.state is command.State.FAILED
+
+
 def test_another_vehicle_is_not_taken_for_this_one(monkeypatch):
     """`quad1` stays armed; `quad2` is disarmed at 1 s, by its pilot."""
     def said(t):
@@ -258,6 +291,18 @@ def test_a_check_that_is_interrupted_leaves_the_motors_off(wait, error):
     with pytest.raises(error):
         command.active_checks(graph, ALL)
     assert graph.commands[-3:] == [command.Command.ARM, command.Command.KILL, command.Command.DISARM]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_terminal_that_is_closed_is_an_interrupt_too(number, monkeypatch):
+    """As of a lost connection to the companion computer: preflight ends, and the motors with it."""
+    before = signal.getsignal(number)
+    with reserved_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        with closing(listener.GraphListener(VEHICLE)) as graph, pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+            graph.spin_for(60.0)
+    assert signal.getsignal(number) is before
 
 
 def test_an_autopilot_may_descend_before_its_motors_stop():

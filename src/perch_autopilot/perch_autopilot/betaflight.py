@@ -14,7 +14,7 @@ from perch_autopilot.clock import clock_jump
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.supervised_link import SupervisedLink
 from perch_autopilot.rates import Sticks, commanded_vehicle, rate_curves
-from perch_autopilot.watchdog import CENTRED, DESCENT, DISARM_AFTER, lifts
+from perch_autopilot.watchdog import CENTRED, DESCENT, DISARM_AFTER, Mode, lifts
 from perch_autopilot.link import REOPEN, LinkError
 
 _HANDSHAKE = 2.0                     # for the autopilot's version [s]
@@ -65,11 +65,13 @@ class Betaflight(Component[BetaflightParameters]):
         except BaseException:
             self._link.close()
             raise
-        self._polls, self._mode = 0, "disarmed"
+        self._polls, self._mode = 0, Mode.DISARMED.value
         self._attitude: tuple[float, float, float] | None = None
         self._battery: msp.Battery | None = None
         self._arming_since: int | None = None   # the host's time since which it is commanded to arm and is not armed [ns]
         self._arm_commanded = False             # the motors are commanded to turn
+        self._was_armed = False                 # and it has been armed since
+        self._disarmed_reports = 0              # in a row that it is not, though it was: one alone may be corrupt
         self._lifted = self._status is not None and self._status.armed  # a command since arming has commanded lift; armed at the start, it may fly
         self._now: int | None = None            # of the last poll [ns]
         self._last_answer = self._last_diagnostics = self._last_open = self._reported_errors = 0
@@ -111,10 +113,10 @@ class Betaflight(Component[BetaflightParameters]):
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Send a command to the autopilot; it is in effect until the next one, or until it is stale."""
         values = (*command.w_B, command.thrust)
-        if not sum(value * value for value in values) < 1e8:
+        if command.armed and not sum(value * value for value in values) < 1e8:
             self.warn(f"rates_thrust_command: {values} is not finite, or too large: ignored", min_interval=1.0)
             return
-        self._arm_commanded = command.armed
+        self._arm_commanded, self._was_armed = command.armed, self._was_armed and command.armed
         sticks = self._sticks.channels(command.w_B, command.thrust) if command.armed else CENTRED
         self._lifted = command.armed and (self._lifted or lifts(sticks, self._throttles()[0]))
         self._link.command(command.armed, sticks)
@@ -140,13 +142,15 @@ class Betaflight(Component[BetaflightParameters]):
             self._reopen(now, error)
         for line in messages:
             self._mode = line
-            self.log(LogLine("info" if line in ("disarmed", "following") else "warning", f"autopilot: {line}"))
+            self.log(LogLine("info" if line in (Mode.DISARMED.value, Mode.FOLLOWING.value) else "warning", f"autopilot: {line}"))
         for frame in {frame.command: frame for frame in self._parser.feed(data)}.values():
             self._handle_frame(frame, now)
         self._polls += 1
         requests = msp.request(msp.RAW_IMU)
         if self._polls % 10 == 0:
             requests += msp.request(_SLOW_REQUESTS[self._polls // 10 % len(_SLOW_REQUESTS)])
+        elif self._disarmed_reports:
+            requests += msp.request(msp.STATUS)
         self._link.request(requests)
         if now - self._last_diagnostics >= NANOSECONDS:
             self._last_diagnostics = now
@@ -198,14 +202,23 @@ class Betaflight(Component[BetaflightParameters]):
                                    f"{low:g} to {high:g} V")
 
     def _check_arming(self, status: msp.Status, now: int) -> None:
-        """Report why the autopilot does not arm; it gives no reason if it does not use the arming switch of this node."""
+        """Report why the autopilot does not arm; it gives no reason if it does not use the arming switch of this node.
+
+        Who disarms it (a pilot, a failsafe, a restart) is obeyed until the commands have the motors off, too.
+        """
+        obeyed = self._was_armed and self._mode == Mode.FOLLOWING.value  # else the watchdog has disarmed it
+        self._disarmed_reports = self._disarmed_reports + 1 if obeyed and not status.armed else 0
         if not self._arm_commanded or status.armed:
-            self._arming_since = None
+            self._arming_since, self._was_armed = None, self._arm_commanded
+        elif self._disarmed_reports == 2:
+            self._was_armed = False
+            self._link.kill()
+            self.log(LogLine("error", "the autopilot was disarmed by its pilot, its failsafe or a restart: it arms again after a disarm"))
         elif self._arming_since is None:
             self._arming_since = now
         elif now - self._arming_since > _REFUSED:
             reasons = "; ".join(status.refusals) or (
-                "the pilot has not handed over: switch MSP OVERRIDE on" if self._mode == "following" else "commands have stopped: disarm first")
+                "the pilot has not handed over: switch MSP OVERRIDE on" if self._mode == Mode.FOLLOWING.value else "its motors were stopped: disarm first")
             self.log(LogLine("error", f"the autopilot refuses to arm: {reasons}", 2.0))
 
     def _diagnose(self, now: int) -> None:

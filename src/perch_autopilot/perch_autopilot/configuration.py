@@ -14,6 +14,8 @@ from perch_core.errors import ConfigError, PerchError
 
 _SET = re.compile(r"set\s+(\w+)\s*=\s*(\S.*)")
 _ANSWER_TIME = 20.0  # for one line, on a busy machine [s]
+_PROMPT = b"\n# "     # comments of a dump begin like it, and pieces of any size arrive: it is the prompt if nothing follows ...
+_SILENCE = 0.05      # ... for this time, longer than an adapter keeps bytes back [s]
 
 
 class CliError(PerchError):
@@ -87,8 +89,8 @@ class Cli:
         """
         self._send((line + end).encode())
         text, last = b"", time.monotonic() + _ANSWER_TIME
-        while not text.endswith(b"\n# "):
-            text += self._receive(0.1)
+        while (more := self._receive(_SILENCE)) or not text.endswith(_PROMPT):
+            text += more
             if time.monotonic() > last:
                 noise = f": {len(text)} bytes received, the last {text[-8:]!r}: is the baud rate right?" if text else ""
                 raise CliError(f"the autopilot's command line does not answer {line!r} within {_ANSWER_TIME:g} s{noise}")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
 import select
 import socket
 import termios
-import tty
 
 from perch_core.errors import PerchError
 
@@ -49,7 +49,9 @@ class Link:
             else:
                 self.file = _opened_port(address)
             os.set_blocking(self.file, False)
-        except (OSError, OverflowError) as error:
+        except LinkError:
+            raise
+        except (OSError, OverflowError, ValueError) as error:  # ValueError: a name that no host or file can have
             raise LinkError(f"{address}: cannot be opened: {getattr(error, 'strerror', None) or error}") from None
 
     def write(self, data: bytes) -> bool:
@@ -108,8 +110,10 @@ def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socke
     lock = socket.socket(socket.AF_UNIX)
     try:
         lock.bind(f"\0perch_autopilot {address}")
-    except OSError:
+    except OSError as error:
         lock.close()
+        if error.errno != errno.EADDRINUSE:  # its name is too long
+            raise
         raise PortTaken(f"{address}: {_TAKEN}") from None
     try:
         connection = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
@@ -144,10 +148,10 @@ def _set_serial(file: int, baud: str, address: str) -> None:
     speed = getattr(termios, f"B{baud}", None)
     if speed is None:
         raise LinkError(f"{address}: {baud} is not a baud rate of a serial port")
+    plain = termios.CS8 | termios.CREAD | termios.CLOCAL  # no flow control, one stop bit, whatever its last user has set
     try:
-        tty.setraw(file)
-        attributes = termios.tcgetattr(file)
-        attributes[4] = attributes[5] = speed
-        termios.tcsetattr(file, termios.TCSANOW, attributes)
+        characters = termios.tcgetattr(file)[6]
+        characters[termios.VMIN], characters[termios.VTIME] = 1, 0
+        termios.tcsetattr(file, termios.TCSANOW, [0, 0, plain, 0, speed, speed, characters])
     except termios.error as error:
         raise LinkError(f"{address}: is not a serial port: {error.args[-1]}") from None

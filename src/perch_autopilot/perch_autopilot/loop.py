@@ -80,7 +80,7 @@ class FirmwareLoop:
 
     def command(self, now: int, armed: bool, rates: Sequence[float], thrust: float) -> None:
         """Accept a command at a time [ns]: body rates in B [rad/s], collective thrust / mass [m/s^2]."""
-        self.watchdog.command(now / NANOSECONDS, armed, self.sticks.channels(rates, thrust))
+        self.watchdog.command(now / NANOSECONDS, armed, self.sticks.channels(rates, thrust) if armed else CENTRED)
 
     def speeds(self, now: int, x: np.ndarray, speeds: np.ndarray, sample: Reading) -> np.ndarray:
         """Return the target speeds of the rotors for the period that begins now [ns], shape (4,) [rad/s]; zero if they stand.

@@ -128,15 +128,16 @@ class Mavlink(Component[MavlinkParameters]):
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Store a command, which each poll sends until it is stale."""
-        if not sum(value * value for value in (*command.w_B, command.thrust)) < 1e8:
+        if command.armed and not sum(value * value for value in (*command.w_B, command.thrust)) < 1e8:
             self.warn("rates_thrust_command: not finite, or too large: ignored", min_interval=1.0)
             return
         self._command, self._command_time = command, self._now or 0
 
     def on_command(self, command: ControllerCommand) -> None:
-        """Stop the motors on KILL in any mode and at any height, also where no controller is there to obey it."""
+        """Stop the motors on KILL in any mode and at any height, also where no controller is there to obey it, or a frame is lost."""
         if command.command == Command.KILL and not command.is_stale(self._now or 0):
             self._command = None
+            self.offboard.kill((self._now or 0) * 1e-9)
             self._send_command(_ARM_DISARM, 0.0, _FORCED)
 
     def on_odometry(self, state: OdometryState) -> None:
@@ -183,9 +184,10 @@ class Mavlink(Component[MavlinkParameters]):
         command = self._command if self.offboard.takes_thrust else None
         if command is not None and not 0 <= now - self._command_time <= _HELD:
             command = None
-        if command is not None and not command.armed and self.offboard.armed and not self.offboard.commanding:
-            self.log(LogLine("error", "commands have the motors off, but a flight may have begun before them (was the controller started "
-                                      "again?): not obeyed until the autopilot is disarmed by its pilot or its failsafe", 2.0))
+        if command is not None and not self.offboard.obeys(command.armed):
+            self.log(LogLine("error", "KILL was received: commands with the motors on are not obeyed until they have them off" if command.armed else
+                             "commands have the motors off, but a flight may have begun before them (was the controller started "
+                             "again?): not obeyed until the autopilot is disarmed by its pilot or its failsafe", 2.0))
             command = None
         if command is not None:
             self._send_set_point(command)
@@ -195,7 +197,7 @@ class Mavlink(Component[MavlinkParameters]):
         elif request is Request.ARM:
             self._send_command(_ARM_DISARM, 1.0)
         elif request is Request.DISARM:
-            self._send_command(_ARM_DISARM, 0.0, _FORCED if self.offboard.forced else 0.0)
+            self._send_command(_ARM_DISARM, 0.0, _FORCED if self.offboard.forced or self.offboard.killed else 0.0)
         if now - self._last_heartbeat >= NANOSECONDS:
             self._last_heartbeat = now
             self._send(self._mavlink.heartbeat_encode(18, 8, 0, 0, 4))                 # ONBOARD_CONTROLLER, INVALID, ACTIVE
@@ -222,7 +224,8 @@ class Mavlink(Component[MavlinkParameters]):
         self.close()
         before = self.offboard
         self.offboard = Offboard(before.autopilot, options=before.options, angle_boost=before.angle_boost, was_armed=before.was_armed,
-                                 forced=before.forced, commanding=before.commanding)
+                                 forced=before.forced, commanding=before.commanding, killed=before.killed,
+                                 _disarm_until=before._disarm_until)
         self._clock, self._last_sample = ClockOffset(), None
 
     def _send_command(self, command: int, *words: float) -> None:

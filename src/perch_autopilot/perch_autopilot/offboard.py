@@ -14,6 +14,7 @@ ANGLE_BOOST = "ATC_ANGLE_BOOST"     # parameter of ArduPilot: 0, or thrust is mu
 MIN_STREAMING_TIME = 0.5            # set points are sent for so long before the mode is requested; PX4 requires more than 2 Hz [s]
 REQUEST_PERIOD = 1.0                # between two requests [s]
 RESTART_GAP = 0.5                   # commands that have stopped for longer may come from a controller that was started again [s]
+KILL_TIME = 5.0                     # for which KILL is repeated, unless a heartbeat has the autopilot disarmed [s]
 HEARTBEAT_TIMEOUT = 2.0             # without a heartbeat for so long the autopilot is considered absent [s]
 
 
@@ -41,6 +42,7 @@ class Offboard:
         forced: the autopilot was commanded with the motors on since it was last disarmed, so it must disarm also in flight.
         commanding: commands have come without a gap since the motors were commanded on, or since the autopilot was disarmed. Only then
             are commands with the motors off obeyed: a controller that was started again in flight is disarmed.
+        killed: KILL was received; no command with the motors on is obeyed until one has them off while the autopilot is disarmed.
     """
 
     autopilot: int = 0
@@ -51,6 +53,8 @@ class Offboard:
     was_armed: bool = False
     forced: bool = False
     commanding: bool = False
+    killed: bool = False
+    _disarm_until: float = -1e9
     _last_heartbeat: float = -1e9
     _streaming_since: float | None = None
     _last_streaming: float = -1e9
@@ -65,10 +69,16 @@ class Offboard:
         """Record a heartbeat of the autopilot at a time [s]."""
         self._last_heartbeat, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
         self.following = custom_mode == self.mode
+        if not self.armed:
+            self._disarm_until = -1e9
 
     def set_time(self, now: float) -> None:
         """Take a time [s] of a clock that has jumped; commands have had no gap by it."""
-        self._last_streaming = now
+        self._last_streaming, self._disarm_until = now, -1e9
+
+    def kill(self, now: float) -> None:
+        """Record KILL, which the autopilot is sent, at a time [s]. It is not repeated later: a pilot may have armed it then."""
+        self.killed, self._disarm_until, self._last_request = True, now + KILL_TIME, now
 
     @property
     def takes_thrust(self) -> bool:
@@ -79,6 +89,10 @@ class Offboard:
     def alive(self, now: float) -> bool:
         """Return whether the last heartbeat is recent at a time [s]."""
         return 0.0 <= now - self._last_heartbeat < HEARTBEAT_TIMEOUT
+
+    def obeys(self, armed: bool) -> bool:
+        """Return whether the autopilot may be sent a command with the motors on (`armed`) or off."""
+        return not self.killed if armed else self.commanding or not self.armed
 
     def next_request(self, now: float, wanted: bool, streaming: bool) -> Request:
         """Return the request to send at a time, at most one each `REQUEST_PERIOD` seconds.
@@ -100,9 +114,12 @@ class Offboard:
         continued = self.commanding and 0.0 <= now - self._last_streaming <= RESTART_GAP
         self.commanding = continued or streaming and (wanted or self.alive(now) and not self.armed)
         request = Request.NOTHING
-        if not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
+        if self.killed:
+            self.killed = self.armed or wanted or not (streaming and self.alive(now))
+            request = Request.DISARM if now <= self._disarm_until else request
+        elif not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
             return request
-        if not wanted:
+        elif not wanted:
             request = Request.DISARM if streaming and self.commanding and self.armed and self.following else request
             self.was_armed = self.was_armed and not streaming
             self.forced = self.forced and self.armed

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import shutil
 import struct
+import subprocess
 import tempfile
 import time
 from collections.abc import Sequence
@@ -80,7 +81,10 @@ class Sitl:
         if not memory.exists():
             self._launch(draft)
             Cli(self.send, self.receive).apply(self._configuration)
-            self._firmware.process.wait(_START)  # saving restarts it, which here is its end
+            try:
+                self._firmware.process.wait(_START)  # saving restarts it, which here is its end
+            except subprocess.TimeoutExpired:
+                raise FirmwareTimeoutError(f"Betaflight's firmware does not save its settings within {_START:g} s") from None
             self._launch(draft)
             Cli(self.send, self.receive).check(self._configuration)
             self.close()
@@ -146,17 +150,32 @@ class Sitl:
     # -- CLI and MSP -------------------------------------------------------------------------------------------------
 
     def send(self, data: bytes) -> None:
-        """Send bytes to the firmware's serial port."""
+        """Send bytes to the firmware's serial port.
+
+        Raises:
+            FirmwareError: the firmware has ended, or does not read.
+        """
         self._firmware.stream.settimeout(_ANSWER)
-        self._firmware.stream.sendall(data)
+        try:
+            self._firmware.stream.sendall(data)
+        except OSError as error:
+            raise FirmwareError(f"Betaflight's firmware cannot be sent anything: {error.strerror or error}") from None
 
     def receive(self, timeout: float) -> bytes:
-        """Return the bytes that arrive from the firmware's serial port within a time [s]."""
+        """Return the bytes that arrive from the firmware's serial port within a time [s].
+
+        Raises:
+            FirmwareError: the firmware has ended.
+        """
         self._firmware.stream.settimeout(timeout)
         try:
-            return self._firmware.stream.recv(4096)
-        except TimeoutError:
+            if data := self._firmware.stream.recv(4096):
+                return data
+        except (TimeoutError, BlockingIOError):
             return b""
+        except OSError:
+            pass
+        raise FirmwareError("Betaflight's firmware has ended: it has closed its serial port")
 
     @property
     def file(self) -> int:

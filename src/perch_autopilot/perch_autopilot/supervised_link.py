@@ -78,13 +78,13 @@ class LinkSupervisor:
     def _send_channels(self, now: float) -> None:
         channels = self._watchdog.channels(now)
         if self._watchdog.mode is not self._reported:
-            self._reported = self._watchdog.mode
-            self._notify(b"M" + self._reported.value.encode())
+            self._report_mode()
         done = not self._watchdog.command_received  # or the autopilot has received this frame, or is commanded by another process
         if self._link is None and now - self._opened > REOPEN:
             self._opened = now
             try:
                 self._link = Link(self._address)
+                self._report_mode()  # in place of the end of the link
             except PortTaken:
                 done = True
             except LinkError:
@@ -95,6 +95,10 @@ class LinkSupervisor:
             self._final_frames, self._stopped = 0, now
         elif done or now - self._stopped > _LINK_WAIT:
             self._final_frames += 1
+
+    def _report_mode(self) -> None:
+        self._reported = self._watchdog.mode
+        self._notify(b"M" + self._reported.value.encode())
 
     def _send(self, data: bytes) -> bool:
         """Send a frame; return whether it has left as a whole."""
@@ -163,10 +167,15 @@ class SupervisedLink:
         passed = [theirs.fileno()] + ([int(address[3:])] if address.startswith("fd:") else [])
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
         words = (theirs.fileno(), hover, descent, disarm_after, *(value for curve in curves for value in astuple(curve)))
-        self.process = subprocess.Popen([sys.executable, "-m", "perch_autopilot.supervised_link", address, *map(str, words)],
-                                        pass_fds=passed, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
-                                        cwd=Path(__file__).parents[1], start_new_session=True)  # not interrupted by Ctrl-C
-        theirs.close()
+        try:
+            self.process = subprocess.Popen([sys.executable, "-m", "perch_autopilot.supervised_link", address, *map(str, words)],
+                                            pass_fds=passed, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
+                                            cwd=Path(__file__).parents[1], start_new_session=True)  # not interrupted by Ctrl-C
+        except OSError as error:  # no memory, too many processes
+            self._control.close()
+            raise LinkError(f"{address}: the process that holds the link cannot be started: {error.strerror}") from None
+        finally:
+            theirs.close()
         self._control.settimeout(20.0)
         try:
             ready_message = self._control.recv(64)
@@ -174,7 +183,10 @@ class SupervisedLink:
             ready_message = b""
         if ready_message != b"M":
             self._control.close()
-            output = self.process.communicate(timeout=5.0)[1].decode(errors="replace").strip().splitlines()
+            with suppress(subprocess.TimeoutExpired):
+                self.process.wait(5.0)  # for its message
+            self.process.kill()
+            output = self.process.communicate()[1].decode(errors="replace").strip().splitlines()
             raise LinkError(output[-1] if output else f"{address}: the process that holds the link does not start")
         if self.process.stderr is not None:
             self.process.stderr.close()

@@ -138,7 +138,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
                 raise MotorCommandError(f"{simulation.vehicle.name} takes {simulation.vehicle.actuation.type}, not {kind}: ignored")
             if command.stamp < self._last_command:
                 raise MotorCommandError(f"{kind}: of {seconds(command.stamp):.3f} s, older than the one before: ignored")
-            if simulation.loop is not None and command.armed and (problem := limits.problem(command)):
+            if simulation.loop is not None and (problem := limits.problem(command)):
                 raise MotorCommandError(f"{kind}: {problem}")
             if simulation.loop is None:
                 simulation.motors.command(self.time, command.armed, *content)

@@ -304,7 +304,14 @@ def _odometry(state: OdometryState) -> bool:
             and _below(state.w_B, 1e4) and len(state.frame) < 256 and _variances(state.pose_covariance) and _variances(state.twist_covariance))
 
 
+def _off(command: MotorCommand | RatesThrust | AttitudeThrust) -> bool:
+    """Return whether the motors are to stop: nothing else of the command counts."""
+    return not command.armed
+
+
 def _motors(command: MotorCommand) -> bool:
+    if _off(command):
+        return True
     a, b, c, d = command.rotor_speed
     return 0.0 <= a <= 1e4 and 0.0 <= b <= 1e4 and 0.0 <= c <= 1e4 and 0.0 <= d <= 1e4
 
@@ -318,5 +325,6 @@ def _variances(covariance: np.ndarray) -> bool:
     return len(entries) == 36 and hypot(*entries) < VARIANCE_MAX and min(entries[::7]) >= 0.0
 
 
-_FAST_CHECKS: dict[type, Callable[[Any], bool]] = {ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motors}
+_FAST_CHECKS: dict[type, Callable[[Any], bool]] = {
+    ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motors, RatesThrust: _off, AttitudeThrust: _off}
 """Fast checks, 1 to 2 us each, by type; where one does not accept a value, `LIMITS` decides."""

@@ -188,6 +188,8 @@ def check_rotation(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicl
         "rotate the vehicle back and forth about all axes, by 20 deg, over a textured surface (--shake)")
     if len(turned_B) < 20:
         return Check(title, Verdict.OPEN, f"{len(turned_B)} pairs of frames", advice)
+    if not np.isfinite(turned_B).all():
+        return Check(title, Verdict.FAILED, "the gyroscope's rates are not finite", "correct its driver")
     R, least = camera_rotation(turned_B, turned_C)
     if least < MIN_ROTATION_RATE:
         return Check(title, Verdict.OPEN, f"{least:.2f} rad/s about the axis turned about least, {MIN_ROTATION_RATE:g} are needed", advice)

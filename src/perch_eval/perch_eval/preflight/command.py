@@ -107,6 +107,8 @@ def _props_off_checks(listener: Any, arguments: argparse.Namespace, bound: float
             takeover = listener.await_takeover(USER_TIMEOUT)
             listener.send_command(Command.DISARM, State.DISARMED)
             print("disarmed: hand over again", flush=True)
+    else:
+        found.append(Check("kill", Verdict.OPEN, "the controller did not arm", "see armed state"))
     if arguments.watchdog and listener.send_command(Command.ARM, State.ARMED).armed:
         print(f"armed: stop the controller's process now (within {USER_TIMEOUT:g} s) ...", flush=True)
         watchdog = listener.await_end_of_commands(USER_TIMEOUT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Sequence
 from copy import copy
@@ -52,7 +53,7 @@ class GraphListener(GraphNode):
     """
 
     def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
-        super().__init__("preflight", in_namespace(namespace))
+        super().__init__("preflight", in_namespace(namespace), (signal.SIGINT, signal.SIGTERM, signal.SIGHUP))  # none leaves it armed
         self.values: dict[str, list[tuple[float, Any]]] = {channel: [] for channel in CHANNELS}
         self.turns: CameraTurns | None = None
         self._speed_max, self._namespace = vehicle.speed_max, namespace.strip("/")
@@ -82,7 +83,7 @@ class GraphListener(GraphNode):
             return
 
     def await_first(self, channel: str, timeout: float) -> None:
-        """Wait for the first value of a channel, as discovery takes time; at most for `patience` [s]."""
+        """Wait for the first value of a channel, as discovery takes time; at most for a time-out [s]."""
         self.spin_until(lambda: self.values[channel], timeout)
 
     def subscribe_camera(self, camera: str, model: Camera) -> None:
@@ -99,10 +100,12 @@ class GraphListener(GraphNode):
         return self.values[channel][-1][1] if self.values[channel] else None
 
     def send_command(self, command: int, state: int) -> CommandResult:
-        """Send the controller a command and wait until it reports a state, or for a time-out."""
-        stamp = getattr(self.newest("odometry"), "stamp", 0)
+        """Send the controller a command and wait until it reports a state, or for a time-out.
+
+        It has no stamp: with that of odometry that has stopped, it would be ignored as too old, and the motors left on.
+        """
         row, begun = topics.topic("controller/command"), time.monotonic()
-        self._command_publisher.publish(row.to_message(ControllerCommand(stamp, command, "preflight, props off")))
+        self._command_publisher.publish(row.to_message(ControllerCommand(0, command, "preflight, props off")))
         status = self.values["controller/status"]
         self.spin_until(lambda: status and status[-1][0] > begun and status[-1][1].state == state, 2.0 * RESPONSE_TIME)
         delay = time.monotonic() - begun
