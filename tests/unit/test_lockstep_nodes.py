@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,6 +19,7 @@ from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult
 from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
 from perch_msgs.action import Perch  # noqa: E402
 from perch_msgs.srv import PlanPerch  # noqa: E402
+from perch_sim.lockstep.link import address, connect_to_vehicle  # noqa: E402
 from perch_sim.ros.participant_node import ParticipantNode  # noqa: E402
 from perch_sim.ros.vehicle_node import VehicleNode  # noqa: E402
 from perch_sim.simulated_vehicle import SimulatedVehicle  # noqa: E402
@@ -139,6 +141,34 @@ def test_a_vehicle_names_the_participants_that_do_not_connect(executor, monkeypa
     for waited in (3.1, 4.0, 14.0):
         vehicle._check_start(vehicle._created_at + waited)
     assert warned == [f"lockstep: for {waited} s waiting for estimator, controller to connect" for waited in (3, 14)]
+
+
+@pytest.fixture
+def vehicle(executor, monkeypatch):
+    """A vehicle that waits for two participants, what it logs, and how a process connects to it."""
+    made, logged, clients = created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=["estimator", "controller"]), [], []
+    monkeypatch.setattr(made, "get_logger", lambda: SimpleNamespace(**dict.fromkeys(("info", "warning", "error"), logged.append)))
+
+    def connect(name):
+        clients.append(connect_to_vehicle(address(os.environ.get("ROS_DOMAIN_ID", "0"), "/"), name, frozenset({"imu/data_raw"})))
+        made._accept_participants()
+        return clients[-1]
+
+    yield made, logged, connect
+    for client in clients:
+        client.close()
+    made.close()
+
+
+def test_while_a_participant_is_connected_no_other_takes_its_place(vehicle):
+    made, logged, connect = vehicle
+    first, second = connect("controller"), connect("controller")
+    assert second.poll(1.0) and not first.poll(0.0) and made._missing() == ["estimator"]
+    with pytest.raises(EOFError):
+        second.recv_bytes()
+    assert logged == ["lockstep: another 'controller' tried to connect: ignored"]
+    made.wiring.participants["estimator"] = None  # of this process
+    assert connect("estimator").poll(1.0)
 
 
 def test_a_vehicle_that_fails_in_a_step_says_so_once_and_why(executor, monkeypatch):

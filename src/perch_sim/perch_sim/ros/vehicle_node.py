@@ -86,15 +86,18 @@ class VehicleNode(ComponentNode):
     # -- participants ------------------------------------------------------------------------------------------------
 
     def _accept_participants(self) -> None:
-        """Accept participants that connect; one that reconnects replaces its former connection."""
+        """Accept participants that connect. A name has one connection: while it lasts, further ones are refused."""
         for name, inputs, connection in self._listener.accept():
             if name not in self._expected:
                 self.warn_once(f"lockstep: {name!r} tried to connect but is not in the parameter participants: ignored")
                 connection.close()
                 continue
             former = self._remote.get(name)
+            if name in self.wiring.participants or former is not None and name not in self._disconnected:
+                self.warn_once(f"lockstep: another {name!r} tried to connect: ignored")
+                connection.close()
+                continue
             if former is not None:
-                self._links.remove(former.connection)
                 former.close()
             one = self._remote[name] = RemoteParticipant(name, inputs, connection)
             self._links.add(connection)
