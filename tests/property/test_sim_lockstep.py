@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import struct
+import threading
 from dataclasses import dataclass
+from multiprocessing import connection as sockets
 
 import numpy as np
 import pytest
@@ -12,7 +16,7 @@ from perch_core.component import Action, Client, Component, Input, Output, Servi
 from perch_core.errors import PerchError
 from perch_core.values import CameraImage
 from perch_sim.lockstep import Answer, Arrival, LocalParticipant, Packet, PendingInput, Schedule, Task, local_servers
-from perch_sim.lockstep.link import pack, unpack
+from perch_sim.lockstep.link import ParticipantListener, address, pack, unpack
 from perch_sim.pacing import MAX_CATCH_UP, Pacing
 
 MS = 1_000_000
@@ -458,6 +462,49 @@ def test_a_batch_that_is_cut_short_is_refused():
     for length in range(len(data)):
         with pytest.raises(PerchError, match="not a batch"):
             unpack(data[:length], None)
+
+
+def listener(monkeypatch):
+    """A listener, and how a process connects to it that says `greeting`."""
+    monkeypatch.setattr("perch_sim.lockstep.link._RECEIVE_LIMIT", struct.pack("ll", 0, 50_000))
+    where = address("test", f"{os.getpid()}")
+    made, clients = ParticipantListener(where), []
+
+    def connect(greeting: bytes):
+        clients.append(sockets.Client(where, "AF_UNIX"))
+        clients[-1].send_bytes(greeting)
+        return clients[-1]
+
+    yield made, connect
+    made.close()
+    for client in clients:
+        client.close()
+
+
+def test_a_participant_that_stops_within_a_message_is_not_waited_for(listener):
+    vehicle, connect = listener
+    participant = connect(b'{"node": "vio", "inputs": []}')
+    [(name, _, connection)] = vehicle.accept()
+    os.write(participant.fileno(), struct.pack("!i", 100) + b"the rest never comes")
+    ended = []
+
+    def receive():
+        try:
+            connection.recv_bytes()
+        except OSError as error:
+            ended.append(error)
+
+    reader = threading.Thread(target=receive, daemon=True)
+    reader.start()
+    reader.join(2.0)
+    assert name == "vio" and [type(error) for error in ended] == [BlockingIOError]
+
+
+@pytest.mark.parametrize("greeting", [b"", b"\xff", b"3", b"{}", b'{"node": "vio", "inputs": 3}', b"[" * 60_000])
+def test_who_greets_with_nonsense_is_no_participant(listener, greeting):
+    vehicle, connect = listener
+    connect(greeting)
+    assert vehicle.accept() == []
 
 
 class Failing(Component[Nothing]):

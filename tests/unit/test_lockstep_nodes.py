@@ -171,6 +171,22 @@ def test_while_a_participant_is_connected_no_other_takes_its_place(vehicle):
     assert connect("estimator").poll(1.0)
 
 
+def test_a_participant_that_ends_before_the_start_is_missing_again(vehicle):
+    made, logged, connect = vehicle
+    connect("controller").close()
+    made._receive(1.0)
+    assert logged == ["lockstep: controller has disconnected"] and made._missing() == ["estimator", "controller"]
+    connect("controller")
+    assert made._missing() == ["estimator"]
+
+
+def test_a_participant_that_answers_with_no_batch_is_disconnected_and_the_log_says_why(vehicle):
+    made, logged, connect = vehicle
+    connect("controller").send_bytes(b"nonsense")
+    made._receive(1.0)
+    assert len(logged) == 1 and logged[0].startswith("lockstep: controller is disconnected: lockstep: 8 bytes are not a batch")
+
+
 def test_a_vehicle_that_fails_in_a_step_says_so_once_and_why(executor, monkeypatch):
     vehicle = created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=[""])
     calls, errors, reported = [], [], []

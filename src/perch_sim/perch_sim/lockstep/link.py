@@ -21,8 +21,8 @@ from perch_sim.lockstep.packet import Codec, Packet
 
 _BATCH, _PACKET = struct.Struct("<qI"), struct.Struct("<HI")  # stamp [ns] and number of packets; lengths of channel and data [byte]
 _PEER = struct.Struct("3i")                                   # process, user, group
-
 _SEND_LIMIT = struct.pack("ll", 0, 20_000)                    # longest wait for a participant that does not read [s, us]
+_RECEIVE_LIMIT = struct.pack("ll", 10, 0)                     # ... and for the rest of a message that has begun [s, us]
 _LENGTH = struct.Struct("!i")                                 # of a message, as in multiprocessing
 
 
@@ -91,11 +91,12 @@ class ParticipantListener:
                 with socket.socket(fileno=os.dup(connection.fileno())) as peer:
                     user = _PEER.unpack(peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
                     peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_LIMIT)
+                    peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_LIMIT)
                 if user != os.getuid() or not connection.poll(1.0):
                     raise OSError("not the same user, or silent")
                 greeting = json.loads(connection.recv_bytes(1 << 16))
                 accepted.append((str(greeting["node"]), frozenset(map(str, greeting["inputs"])), connection))
-            except (OSError, EOFError, ValueError, KeyError, TypeError):
+            except (OSError, EOFError, ValueError, KeyError, TypeError, RecursionError):
                 connection.close()
 
     def close(self) -> None:

@@ -115,10 +115,14 @@ class VehicleNode(ComponentNode):
         for connection in connections:
             one = next(remote for remote in self._remote.values() if remote.connection is connection)
             one.receive()
-            if one.closed:
+            if one.ended:
                 self._links.remove(connection)
-                self._disconnected.add(one.name)
-                self.get_logger().error(f"lockstep: {one.name} has disconnected")
+                self.get_logger().error(f"lockstep: {one.name} {one.ended}")
+                if self._started:
+                    self._disconnected.add(one.name)
+                else:  # it is missing again
+                    del self._remote[one.name]
+                    one.close()
         return bool(connections)
 
     def _missing(self) -> list[str]:
