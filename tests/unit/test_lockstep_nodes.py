@@ -187,6 +187,13 @@ def test_a_participant_that_answers_with_no_batch_is_disconnected_and_the_log_sa
     assert len(logged) == 1 and logged[0].startswith("lockstep: controller is disconnected: lockstep: 8 bytes are not a batch")
 
 
+def test_every_command_of_a_node_outside_the_lockstep_is_warned_of(vehicle, monkeypatch):
+    made, logged, _ = vehicle
+    monkeypatch.setattr("perch_sim.ros.vehicle_node.foreign_publishers", lambda node, topic, known: ["/stranger"])
+    made._warn_foreign_publishers()
+    assert [line.split(":")[0] for line in logged] == ["attitude_thrust_command", "motor_command", "rates_thrust_command"]
+
+
 def test_a_vehicle_that_fails_in_a_step_says_so_once_and_why(executor, monkeypatch):
     vehicle = created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=[""])
     calls, errors, reported = [], [], []

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from perch_core.component import Component
+from perch_core.component import Component, Input, ports
 from perch_core.ros import topics
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import SHARED_TOPICS
@@ -262,7 +262,7 @@ class VehicleNode(ComponentNode):
     def _warn_foreign_publishers(self) -> None:
         """Warn of nodes that publish on topics of the flight without taking part; their messages are ignored."""
         inputs = set().union(*(one.inputs for one in (*self._remote.values(), *self.wiring.participants.values())))
-        inputs = (inputs - set(SHARED_TOPICS)) | {"motor_command"}
+        inputs = (inputs - set(SHARED_TOPICS)) | {port.channel(self.component) for port in ports(type(self.component), Input)}
         members = {f"{self.get_namespace().rstrip('/')}/{name}" for name in (*self._expected, self.get_name())}
         for channel in sorted(inputs):
             for publisher in foreign_publishers(self, self.resolve_topic_name(channel), members):
