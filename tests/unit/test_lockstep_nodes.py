@@ -12,7 +12,7 @@ pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from perch_core.component import Action, Client, Component, Service, Timer, Unavailable  # noqa: E402
-from perch_core.errors import PerchError  # noqa: E402
+from perch_core.errors import ConfigError, PerchError  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
 from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult  # noqa: E402
@@ -192,6 +192,11 @@ def test_every_command_of_a_node_outside_the_lockstep_is_warned_of(vehicle, monk
     monkeypatch.setattr("perch_sim.ros.vehicle_node.foreign_publishers", lambda node, topic, known: ["/stranger"])
     made._warn_foreign_publishers()
     assert [line.split(":")[0] for line in logged] == ["attitude_thrust_command", "motor_command", "rates_thrust_command"]
+
+
+def test_a_participant_that_there_is_not_is_refused(executor):
+    with pytest.raises(ConfigError, match="participants: 'controler' is not one of estimator, controller, vio"):
+        created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=["controler"])
 
 
 def test_a_vehicle_that_fails_in_a_step_says_so_once_and_why(executor, monkeypatch):
