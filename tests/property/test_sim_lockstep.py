@@ -464,6 +464,22 @@ def test_a_batch_that_is_cut_short_is_refused():
             unpack(data[:length], None)
 
 
+def test_a_flight_begun_anew_has_its_timers_at_once_and_the_answers_of_the_old_one():
+    answers = []
+
+    def ask(channel, request):
+        answers.append(Answer())
+        return answers[-1]
+
+    asking = LocalParticipant(Asking(Nothing()), send_request=ask)
+    assert said(asking, 40_000 * MS, 60_000 * MS) == ["tick 40000000000"]
+    assert said(asking, 1_000 * MS) is None
+    answers[0]("of the old one")
+    assert [packet.value for packet in asking.results()] == ["answer of the old one", "tick 1000000000"]
+    assert said(asking, 1_020 * MS) == ["tick 1020000000"]
+
+
+@pytest.fixture
 def listener(monkeypatch):
     """A listener, and how a process connects to it that says `greeting`."""
     monkeypatch.setattr("perch_sim.lockstep.link._RECEIVE_LIMIT", struct.pack("ll", 0, 50_000))

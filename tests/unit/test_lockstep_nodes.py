@@ -19,7 +19,7 @@ from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult
 from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
 from perch_msgs.action import Perch  # noqa: E402
 from perch_msgs.srv import PlanPerch  # noqa: E402
-from perch_sim.lockstep.link import address, connect_to_vehicle  # noqa: E402
+from perch_sim.lockstep.link import ParticipantListener, address, connect_to_vehicle, pack  # noqa: E402
 from perch_sim.ros.participant_node import ParticipantNode  # noqa: E402
 from perch_sim.ros.vehicle_node import VehicleNode  # noqa: E402
 from perch_sim.simulated_vehicle import SimulatedVehicle  # noqa: E402
@@ -197,6 +197,23 @@ def test_every_command_of_a_node_outside_the_lockstep_is_warned_of(vehicle, monk
 def test_a_participant_that_there_is_not_is_refused(executor):
     with pytest.raises(ConfigError, match="participants: 'controler' is not one of estimator, controller, vio"):
         created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=["controler"])
+
+
+def test_a_participant_that_waits_within_a_step_notices_that_the_vehicle_has_ended(executor):
+    listener = ParticipantListener(address(os.environ.get("ROS_DOMAIN_ID", "0"), "/"))
+    asking = created(executor, ParticipantNode, Asking)
+    try:
+        asking.wiring.run_on(executor)
+        asking.component.plan_perch(REQUEST, 0)
+        [(_, _, connection)] = listener.accept()
+        connection.send_bytes(pack(1, []))
+        until(executor, lambda: asking._busy)
+        connection.close()
+        until(executor, lambda: asking._vehicle is None)
+        assert not asking.component.answers
+        until(executor, lambda: listener.accept())
+    finally:
+        listener.close()
 
 
 def test_a_vehicle_that_fails_in_a_step_says_so_once_and_why(executor, monkeypatch):

@@ -169,9 +169,13 @@ class LocalParticipant(Participant):
     # -- batches -----------------------------------------------------------------------------------------------------
 
     def begin(self, now: int, batch: Sequence[Packet]) -> None:
-        """Process a batch, or wait for the goal or the answers that it needs."""
+        """Process a batch, or wait for the goal or the answers that it needs; in a new flight, for all answers of the old one."""
         if now > START_DEADLINE:
             self._await_goal = ""
+        if now < self.now:  # the vehicle has been started again
+            for timer in self._timers:
+                timer[0] = 0
+            self._awaited = [awaited._replace(due=0) for awaited in self._awaited]
         self.now, self._batch, self._begun = now, iter(batch), True
         self._continue_batch()
 

@@ -132,7 +132,9 @@ class ParticipantNode(ComponentNode):
             return
         packets = self.participant.results()
         if packets is None:
-            if self._check_timer.is_canceled():
+            if self._connection_poll.ready(0.0):  # it sends nothing before it has the results: it has ended
+                self._disconnect()
+            elif self._check_timer.is_canceled():
                 self._check_timer.reset()
             return
         self._busy = False
@@ -157,6 +159,7 @@ class ParticipantNode(ComponentNode):
     def _disconnect(self) -> None:
         """Close the connection to a vehicle that has ended; another one may be found later."""
         self._busy = False
+        self._check_timer.cancel()
         self._connection_poll.remove(self._vehicle)
         self._vehicle, self._without_vehicle_since = None, time.monotonic()
 
