@@ -523,6 +523,25 @@ def test_who_greets_with_nonsense_is_no_participant(listener, greeting):
     assert vehicle.accept() == []
 
 
+def test_bytes_for_the_vehicle_that_are_no_message_are_refused_and_the_flight_goes_on():
+    class Codec:
+        def decode(self, channel, data):
+            if not data:
+                raise PerchError("not a whole command")
+            return tuple(data)
+
+    class Remote(LocalParticipant):
+        def results(self):
+            return [Packet.received("motor_command", data, Codec()) for data in (b"", b"\1\2")] if super().results() is not None else None
+
+    vehicle, lines = Vehicle(), []
+    vehicle.log.receivers.append(lines.append)
+    schedule = Schedule(vehicle, [Remote(Estimator())], tasks(10, 10))
+    assert schedule.advance() and schedule.advance()
+    assert vehicle.commands == [(STEP, (1, 2)), (2 * STEP, (1, 2))]
+    assert [(line.level, line.text) for line in lines] == [("warning", "motor_command refused: not a whole command")] * 2
+
+
 class Failing(Component[Nothing]):
     number, said = Input(int, "number"), Output(str, "said")
     tick = Timer(0.02)

@@ -125,6 +125,19 @@ def handlers(component: Component[Any]) -> dict[str, Callable[[Any], None]]:
     return found
 
 
+def packet_receiver(component: Component[Any], handle: Callable[[Any], None]) -> Callable[[Packet], None]:
+    """Return a receiver of packets for a handler; bytes that are no message are refused with a warning."""
+    def receive(packet: Packet) -> None:
+        try:
+            value = packet.value
+        except PerchError as error:
+            component.warn(f"{packet.channel} refused: {error}", min_interval=1.0)
+        else:
+            handle(value)
+
+    return receive
+
+
 class LocalParticipant(Participant):
     """A component in this process, which processes a batch when it begins.
 
