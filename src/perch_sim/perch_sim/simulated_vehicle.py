@@ -89,7 +89,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
             raise
         self.time = self.simulation.time
         self._index = 0                          # steps so far
-        self._last_command = 0                   # newest stamp of a command
+        self._last_command = 0                   # newest stamp of a command that was not refused
         self._pacing: Pacing | None = None       # in real time
         self._broken: set[str] = set()           # cameras without images for the rest of the flight
         self._diagnosed, self._last_counts = self.time, (0, 0)  # time of the last diagnostics; steps and missed commands by then
@@ -148,8 +148,9 @@ class SimulatedVehicle(Component[VehicleParameters]):
         except MotorCommandError as error:
             self._counts["commands_refused"] += 1
             self.log(LogLine("error", str(error), 1.0))
-        if self._last_command < command.stamp <= self.time:
-            self._last_command = command.stamp
+        else:
+            if self._last_command < command.stamp <= self.time:
+                self._last_command = command.stamp
 
     # -- stepping ----------------------------------------------------------------------------------------------------
 
