@@ -199,23 +199,6 @@ def test_a_participant_that_there_is_not_is_refused(executor):
         created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=["controler"])
 
 
-def test_a_participant_that_waits_within_a_step_notices_that_the_vehicle_has_ended(executor):
-    listener = ParticipantListener(address(os.environ.get("ROS_DOMAIN_ID", "0"), "/"))
-    asking = created(executor, ParticipantNode, Asking)
-    try:
-        asking.wiring.run_on(executor)
-        asking.component.plan_perch(REQUEST, 0)
-        [(_, _, connection)] = listener.accept()
-        connection.send_bytes(pack(1, []))
-        until(executor, lambda: asking._busy)
-        connection.close()
-        until(executor, lambda: asking._vehicle is None)
-        assert not asking.component.answers
-        until(executor, lambda: listener.accept())
-    finally:
-        listener.close()
-
-
 def test_a_vehicle_that_fails_in_a_step_says_so_once_and_why(executor, monkeypatch):
     vehicle = created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=[""])
     calls, errors, reported = [], [], []
@@ -259,6 +242,20 @@ class Failing(Component[Nothing]):
     def on_perch(self, goal) -> str:
         """A defect."""
         raise ZeroDivisionError("no goal is foreseen")
+
+
+def test_a_participant_that_waits_for_its_first_goal_notices_that_the_vehicle_has_ended(executor):
+    listener = ParticipantListener(address(os.environ.get("ROS_DOMAIN_ID", "0"), "/"))
+    waiting = created(executor, ParticipantNode, Failing, lockstep_hold="perch")
+    try:
+        waiting.wiring.run_on(executor)
+        [(_, _, connection)] = listener.accept()
+        connection.send_bytes(pack(1, []))
+        until(executor, lambda: waiting._busy)
+        connection.close()
+        until(executor, lambda: listener.accept())
+    finally:
+        listener.close()
 
 
 @pytest.mark.parametrize("make", [participant, lambda executor, kind: created(executor, ArrivalNode, kind)], ids=["lockstep", "arrival"])

@@ -132,7 +132,8 @@ class ParticipantNode(ComponentNode):
             return
         packets = self.participant.results()
         if packets is None:
-            if self._connection_poll.ready(0.0):  # it sends nothing before it has the results: it has ended
+            # The vehicle sends nothing before it has the results: it has ended. Answers come or are given up, but goals may never come.
+            if self._connection_poll.ready(0.0) and all(request.answer.done() for request in self._open_requests):
                 self._disconnect()
             elif self._check_timer.is_canceled():
                 self._check_timer.reset()
