@@ -157,7 +157,6 @@ def vehicle(executor, monkeypatch):
     yield made, logged, connect
     for client in clients:
         client.close()
-    made.close()
 
 
 def test_while_a_participant_is_connected_no_other_takes_its_place(vehicle):
