@@ -11,11 +11,11 @@ import pytest
 pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
-from perch_core.component import Action, Client, Component, Service, Timer, Unavailable  # noqa: E402
+from perch_core.component import Action, Client, Component, Output, Service, Timer, Unavailable  # noqa: E402
 from perch_core.errors import ConfigError, PerchError  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
-from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult  # noqa: E402
+from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult, TargetPose  # noqa: E402
 from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
 from perch_msgs.action import Perch  # noqa: E402
 from perch_msgs.srv import PlanPerch  # noqa: E402
@@ -257,7 +257,18 @@ def test_a_participant_that_waits_for_its_first_goal_notices_that_the_vehicle_ha
         listener.close()
 
 
-@pytest.mark.parametrize("make", [participant, lambda executor, kind: created(executor, ArrivalNode, kind)], ids=["lockstep", "arrival"])
+class Drawing(Component[Nothing]):
+    """Has a picture for people, and what participants take."""
+
+    config_type = Nothing
+    debug_image, target = Output(CameraImage, "vio/debug_image"), Output(TargetPose, "target/pose")
+
+
+def test_pictures_for_people_are_not_drawn_for_a_vehicle_in_another_process(executor):
+    drawing = created(executor, ParticipantNode, Drawing).component
+    assert drawing.target.has_receivers and not drawing.debug_image.has_receivers
+
+
 def test_requests_and_goals_that_a_component_fails_on_are_answered(executor, make):
     node = make(executor, Failing)
     planner, mission = node.create_client(PlanPerch, "plan_perch"), ActionClient(node, Perch, "perch")

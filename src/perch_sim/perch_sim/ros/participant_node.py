@@ -35,6 +35,7 @@ ANSWER_TIMEOUT = 50.0  # an answer this late was lost with its server: more than
 WARN_AFTER = 3.0       # a vehicle that is missing, or a server that has not answered, for so long is reported [s]
 WARN_REPEAT = 10.0     # between reports of a missing vehicle [s]
 BURST = 40             # batches between which other events are processed
+UNTAKEN = ("vio/debug_image",)  # outputs that no participant takes: each value would be drawn and sent for nobody
 OBSERVED = ("/diagnostics", "/tf", "/tf_static", "robot_description")  # taken on arrival by components that only store messages
 
 
@@ -87,6 +88,7 @@ class ParticipantNode(ComponentNode):
             return
         if is_slow(self.get_name()):
             priority.lower_priority()  # steps take priority over slow work
+        self.participant.set_channel_filter(lambda channel: channel not in UNTAKEN)
         self._where = address(os.environ.get("ROS_DOMAIN_ID", "0"), self.get_namespace())
         self._check_timer = self.create_timer(CHECK_PERIOD, self._finish_batch, clock=self._steady)
         self._check_timer.cancel()
