@@ -542,6 +542,18 @@ def test_bytes_for_the_vehicle_that_are_no_message_are_refused_and_the_flight_go
     assert [(line.level, line.text) for line in lines] == [("warning", "motor_command refused: not a whole command")] * 2
 
 
+def test_a_value_that_has_no_message_is_left_out_of_a_batch_and_named():
+    class Codec:
+        def encode(self, channel, value):
+            if value < 0:
+                raise ValueError("below zero")
+            return bytes([value])
+
+    failures = []
+    data = pack(5, [Packet("number", value, Codec()) for value in (1, -1, 2)], lambda channel, error: failures.append((channel, str(error))))
+    assert [packet.data for packet in unpack(data, None)[1]] == [b"\1", b"\2"] and failures == [("number", "below zero")]
+
+
 class Failing(Component[Nothing]):
     number, said = Input(int, "number"), Output(str, "said")
     tick = Timer(0.02)

@@ -19,7 +19,7 @@ from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult
 from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
 from perch_msgs.action import Perch  # noqa: E402
 from perch_msgs.srv import PlanPerch  # noqa: E402
-from perch_sim.lockstep.link import ParticipantListener, address, connect_to_vehicle, pack  # noqa: E402
+from perch_sim.lockstep.link import ParticipantListener, address, connect_to_vehicle, pack, unpack  # noqa: E402
 from perch_sim.ros.participant_node import ParticipantNode  # noqa: E402
 from perch_sim.ros.vehicle_node import VehicleNode  # noqa: E402
 from perch_sim.simulated_vehicle import SimulatedVehicle  # noqa: E402
@@ -269,6 +269,22 @@ def test_pictures_for_people_are_not_drawn_for_a_vehicle_in_another_process(exec
     assert drawing.target.has_receivers and not drawing.debug_image.has_receivers
 
 
+def test_a_value_without_a_message_ends_no_process(executor, monkeypatch):
+    listener, refused = ParticipantListener(address(os.environ.get("ROS_DOMAIN_ID", "0"), "/")), []
+    drawing = created(executor, ParticipantNode, Drawing)
+    monkeypatch.setattr(drawing, "log_refusal", lambda name, error: refused.append(name))
+    try:
+        drawing.wiring.run_on(executor)
+        [(_, _, connection)] = listener.accept()
+        drawing.component.target("a defect")
+        connection.send_bytes(pack(1, []))
+        until(executor, lambda: connection.poll(0.0))
+        assert unpack(connection.recv_bytes(), None)[1] == [] and refused == ["target/pose"]
+    finally:
+        listener.close()
+
+
+@pytest.mark.parametrize("make", [participant, lambda executor, kind: created(executor, ArrivalNode, kind)], ids=["lockstep", "arrival"])
 def test_requests_and_goals_that_a_component_fails_on_are_answered(executor, make):
     node = make(executor, Failing)
     planner, mission = node.create_client(PlanPerch, "plan_perch"), ActionClient(node, Perch, "perch")

@@ -12,7 +12,7 @@ import os
 import select
 import socket
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Client, Connection, Listener
 
@@ -31,13 +31,25 @@ def address(domain: str, namespace: str) -> str:
     return f"\0perch-lockstep-{os.getuid()}-{domain}-{namespace.strip('/')}"
 
 
-def pack(stamp: int, packets: Sequence[Packet]) -> bytes:
-    """Return a batch, or its results, as bytes."""
-    parts = [_BATCH.pack(stamp, len(packets))]
+def pack(stamp: int, packets: Sequence[Packet], on_failure: Callable[[str, Exception], None] | None = None) -> bytes:
+    """Return a batch, or its results, as bytes.
+
+    Args:
+        stamp: of the batch [ns].
+        packets: in order.
+        on_failure: called with channel and exception for each value that has no message, which is left out; None: it is raised.
+    """
+    parts: list[bytes] = []
     for packet in packets:
-        channel, data = packet.channel.encode(), packet.data
-        parts += (_PACKET.pack(len(channel), len(data)), channel, data)
-    return b"".join(parts)
+        try:
+            channel, data = packet.channel.encode(), packet.data
+        except Exception as error:
+            if on_failure is None:
+                raise
+            on_failure(packet.channel, error)
+        else:
+            parts += (_PACKET.pack(len(channel), len(data)), channel, data)
+    return b"".join((_BATCH.pack(stamp, len(parts) // 3), *parts))
 
 
 def unpack(data: bytes, codec: Codec) -> tuple[int, list[Packet]]:

@@ -144,7 +144,7 @@ class ParticipantNode(ComponentNode):
         waited = not self._check_timer.is_canceled()
         self._check_timer.cancel()
         try:
-            self._vehicle.send_bytes(pack(0, packets))
+            self._vehicle.send_bytes(pack(0, packets, self.log_refusal))
         except OSError:
             self._disconnect()
             return

@@ -20,10 +20,16 @@ class RemoteParticipant(Participant):
         ended: why the connection has ended, for the log; empty: it has not.
     """
 
-    def __init__(self, name: str, inputs: frozenset[str], connection: Connection) -> None:
+    def __init__(self, name: str, inputs: frozenset[str], connection: Connection, on_failure: Callable[[str, Exception], None]) -> None:
+        """
+        Args:
+            name, inputs: see `Participant`.
+            connection: to its process.
+            on_failure: called with channel and exception for each value that has no message, which is not sent.
+        """
         self.name, self.inputs, self.connection = name, inputs, connection
         self.ended = ""
-        self._sender = NonBlockingSender(connection)
+        self._sender, self._on_failure = NonBlockingSender(connection), on_failure
         self._results: list[Packet] | None = None
         self._is_taken: Callable[[str], bool] = lambda channel: True
 
@@ -31,7 +37,7 @@ class RemoteParticipant(Participant):
         """Send a batch."""
         self._results = None
         try:
-            self._sender.send(pack(now, batch))
+            self._sender.send(pack(now, batch, self._on_failure))
         except OSError:
             self.ended = DISCONNECTED
 

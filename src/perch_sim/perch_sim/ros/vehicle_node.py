@@ -99,7 +99,7 @@ class VehicleNode(ComponentNode):
                 continue
             if former is not None:
                 former.close()
-            one = self._remote[name] = RemoteParticipant(name, inputs, connection)
+            one = self._remote[name] = RemoteParticipant(name, inputs, connection, self.log_refusal)
             self._links.add(connection)
             self._dropped.discard(name)
             self._disconnected.discard(name)
