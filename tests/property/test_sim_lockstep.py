@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import struct
+import threading
 from dataclasses import dataclass
+from multiprocessing import connection as sockets
 
 import numpy as np
 import pytest
@@ -12,7 +16,7 @@ from perch_core.component import Action, Client, Component, Input, Output, Servi
 from perch_core.errors import PerchError
 from perch_core.values import CameraImage
 from perch_sim.lockstep import Answer, Arrival, LocalParticipant, Packet, PendingInput, Schedule, Task, local_servers
-from perch_sim.lockstep.link import pack, unpack
+from perch_sim.lockstep.link import ParticipantListener, address, pack, unpack
 from perch_sim.pacing import MAX_CATCH_UP, Pacing
 
 MS = 1_000_000
@@ -458,6 +462,96 @@ def test_a_batch_that_is_cut_short_is_refused():
     for length in range(len(data)):
         with pytest.raises(PerchError, match="not a batch"):
             unpack(data[:length], None)
+
+
+def test_a_flight_begun_anew_has_its_timers_at_once_and_the_answers_of_the_old_one():
+    answers = []
+
+    def ask(channel, request):
+        answers.append(Answer())
+        return answers[-1]
+
+    asking = LocalParticipant(Asking(Nothing()), send_request=ask)
+    assert said(asking, 40_000 * MS, 60_000 * MS) == ["tick 40000000000"]
+    assert said(asking, 1_000 * MS) is None
+    answers[0]("of the old one")
+    assert [packet.value for packet in asking.results()] == ["answer of the old one", "tick 1000000000"]
+    assert said(asking, 1_020 * MS) == ["tick 1020000000"]
+
+
+@pytest.fixture
+def listener(monkeypatch):
+    """A listener, and how a process connects to it that says `greeting`."""
+    monkeypatch.setattr("perch_sim.lockstep.link._RECEIVE_LIMIT", struct.pack("ll", 0, 50_000))
+    where = address("test", f"{os.getpid()}")
+    made, clients = ParticipantListener(where), []
+
+    def connect(greeting: bytes):
+        clients.append(sockets.Client(where, "AF_UNIX"))
+        clients[-1].send_bytes(greeting)
+        return clients[-1]
+
+    yield made, connect
+    made.close()
+    for client in clients:
+        client.close()
+
+
+def test_a_participant_that_stops_within_a_message_is_not_waited_for(listener):
+    vehicle, connect = listener
+    participant = connect(b'{"node": "vio", "inputs": []}')
+    [(name, _, connection)] = vehicle.accept()
+    os.write(participant.fileno(), struct.pack("!i", 100) + b"the rest never comes")
+    ended = []
+
+    def receive():
+        try:
+            connection.recv_bytes()
+        except OSError as error:
+            ended.append(error)
+
+    reader = threading.Thread(target=receive, daemon=True)
+    reader.start()
+    reader.join(2.0)
+    assert name == "vio" and [type(error) for error in ended] == [BlockingIOError]
+
+
+@pytest.mark.parametrize("greeting", [b"", b"\xff", b"3", b"{}", b'{"node": "vio", "inputs": 3}', b"[" * 60_000])
+def test_who_greets_with_nonsense_is_no_participant(listener, greeting):
+    vehicle, connect = listener
+    connect(greeting)
+    assert vehicle.accept() == []
+
+
+def test_bytes_for_the_vehicle_that_are_no_message_are_refused_and_the_flight_goes_on():
+    class Codec:
+        def decode(self, channel, data):
+            if not data:
+                raise PerchError("not a whole command")
+            return tuple(data)
+
+    class Remote(LocalParticipant):
+        def results(self):
+            return [Packet.received("motor_command", data, Codec()) for data in (b"", b"\1\2")] if super().results() is not None else None
+
+    vehicle, lines = Vehicle(), []
+    vehicle.log.receivers.append(lines.append)
+    schedule = Schedule(vehicle, [Remote(Estimator())], tasks(10, 10))
+    assert schedule.advance() and schedule.advance()
+    assert vehicle.commands == [(STEP, (1, 2)), (2 * STEP, (1, 2))]
+    assert [(line.level, line.text) for line in lines] == [("warning", "motor_command refused: not a whole command")] * 2
+
+
+def test_a_value_that_has_no_message_is_left_out_of_a_batch_and_named():
+    class Codec:
+        def encode(self, channel, value):
+            if value < 0:
+                raise ValueError("below zero")
+            return bytes([value])
+
+    failures = []
+    data = pack(5, [Packet("number", value, Codec()) for value in (1, -1, 2)], lambda channel, error: failures.append((channel, str(error))))
+    assert [packet.data for packet in unpack(data, None)[1]] == [b"\1", b"\2"] and failures == [("number", "below zero")]
 
 
 class Failing(Component[Nothing]):

@@ -180,6 +180,16 @@ def test_the_vehicle_takes_its_own_kind_of_command_alone():
     assert vehicle.simulation.plant.rotor_speed.max() == 0.0
 
 
+def test_a_vehicle_whose_commands_cease_names_their_topic():
+    flown, reports = SimulatedVehicle(VehicleParameters(cameras="none", vehicle="snapdragon_rates")), []
+    flown.diagnostics.receivers.append(reports.append)
+    flown.advance(), flown.on_rates_thrust(RatesThrust(flown.time, True, (0.0, 0.0, 0.0), 9.81))
+    for _ in range(60):
+        flown.advance()
+    flown.diagnose()
+    assert reports[-1].message == "motors stopped: no rates_thrust_command"
+
+
 def test_nonsense_is_refused_but_stops_the_motors_where_it_disarms():
     vehicle = SimulatedVehicle(VehicleParameters(cameras="none"), SCENARIO)
     lines = said(vehicle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,14 +11,15 @@ import pytest
 pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
-from perch_core.component import Action, Client, Component, Service, Timer, Unavailable  # noqa: E402
-from perch_core.errors import PerchError  # noqa: E402
+from perch_core.component import Action, Client, Component, Output, Service, Timer, Unavailable  # noqa: E402
+from perch_core.errors import ConfigError, PerchError  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
-from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult  # noqa: E402
+from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult, TargetPose  # noqa: E402
 from perch_core.values.planning import PerchPlan, PerchPlanRequest  # noqa: E402
 from perch_msgs.action import Perch  # noqa: E402
 from perch_msgs.srv import PlanPerch  # noqa: E402
+from perch_sim.lockstep.link import ParticipantListener, address, connect_to_vehicle, pack, unpack  # noqa: E402
 from perch_sim.ros.participant_node import ParticipantNode  # noqa: E402
 from perch_sim.ros.vehicle_node import VehicleNode  # noqa: E402
 from perch_sim.simulated_vehicle import SimulatedVehicle  # noqa: E402
@@ -141,6 +143,61 @@ def test_a_vehicle_names_the_participants_that_do_not_connect(executor, monkeypa
     assert warned == [f"lockstep: for {waited} s waiting for estimator, controller to connect" for waited in (3, 14)]
 
 
+@pytest.fixture
+def vehicle(executor, monkeypatch):
+    """A vehicle that waits for two participants, what it logs, and how a process connects to it."""
+    made, logged, clients = created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=["estimator", "controller"]), [], []
+    monkeypatch.setattr(made, "get_logger", lambda: SimpleNamespace(**dict.fromkeys(("info", "warning", "error"), logged.append)))
+
+    def connect(name):
+        clients.append(connect_to_vehicle(address(os.environ.get("ROS_DOMAIN_ID", "0"), "/"), name, frozenset({"imu/data_raw"})))
+        made._accept_participants()
+        return clients[-1]
+
+    yield made, logged, connect
+    for client in clients:
+        client.close()
+
+
+def test_while_a_participant_is_connected_no_other_takes_its_place(vehicle):
+    made, logged, connect = vehicle
+    first, second = connect("controller"), connect("controller")
+    assert second.poll(1.0) and not first.poll(0.0) and made._missing() == ["estimator"]
+    with pytest.raises(EOFError):
+        second.recv_bytes()
+    assert logged == ["lockstep: another 'controller' tried to connect: ignored"]
+    made.wiring.participants["estimator"] = None  # of this process
+    assert connect("estimator").poll(1.0)
+
+
+def test_a_participant_that_ends_before_the_start_is_missing_again(vehicle):
+    made, logged, connect = vehicle
+    connect("controller").close()
+    made._receive(1.0)
+    assert logged == ["lockstep: controller has disconnected"] and made._missing() == ["estimator", "controller"]
+    connect("controller")
+    assert made._missing() == ["estimator"]
+
+
+def test_a_participant_that_answers_with_no_batch_is_disconnected_and_the_log_says_why(vehicle):
+    made, logged, connect = vehicle
+    connect("controller").send_bytes(b"nonsense")
+    made._receive(1.0)
+    assert len(logged) == 1 and logged[0].startswith("lockstep: controller is disconnected: lockstep: 8 bytes are not a batch")
+
+
+def test_every_command_of_a_node_outside_the_lockstep_is_warned_of(vehicle, monkeypatch):
+    made, logged, _ = vehicle
+    monkeypatch.setattr("perch_sim.ros.vehicle_node.foreign_publishers", lambda node, topic, known: ["/stranger"])
+    made._warn_foreign_publishers()
+    assert [line.split(":")[0] for line in logged] == ["attitude_thrust_command", "motor_command", "rates_thrust_command"]
+
+
+def test_a_participant_that_there_is_not_is_refused(executor):
+    with pytest.raises(ConfigError, match="participants: 'controler' is not one of estimator, controller, vio"):
+        created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=["controler"])
+
+
 def test_a_vehicle_that_fails_in_a_step_says_so_once_and_why(executor, monkeypatch):
     vehicle = created(executor, VehicleNode, SimulatedVehicle, cameras="none", participants=[""])
     calls, errors, reported = [], [], []
@@ -184,6 +241,47 @@ class Failing(Component[Nothing]):
     def on_perch(self, goal) -> str:
         """A defect."""
         raise ZeroDivisionError("no goal is foreseen")
+
+
+def test_a_participant_that_waits_for_its_first_goal_notices_that_the_vehicle_has_ended(executor):
+    listener = ParticipantListener(address(os.environ.get("ROS_DOMAIN_ID", "0"), "/"))
+    waiting = created(executor, ParticipantNode, Failing, lockstep_hold="perch")
+    try:
+        waiting.wiring.run_on(executor)
+        [(_, _, connection)] = listener.accept()
+        connection.send_bytes(pack(1, []))
+        until(executor, lambda: waiting._busy)
+        connection.close()
+        until(executor, lambda: listener.accept())
+    finally:
+        listener.close()
+
+
+class Drawing(Component[Nothing]):
+    """Has a picture for people, and what participants take."""
+
+    config_type = Nothing
+    debug_image, target = Output(CameraImage, "vio/debug_image"), Output(TargetPose, "target/pose")
+
+
+def test_pictures_for_people_are_not_drawn_for_a_vehicle_in_another_process(executor):
+    drawing = created(executor, ParticipantNode, Drawing).component
+    assert drawing.target.has_receivers and not drawing.debug_image.has_receivers
+
+
+def test_a_value_without_a_message_ends_no_process(executor, monkeypatch):
+    listener, refused = ParticipantListener(address(os.environ.get("ROS_DOMAIN_ID", "0"), "/")), []
+    drawing = created(executor, ParticipantNode, Drawing)
+    monkeypatch.setattr(drawing, "log_refusal", lambda name, error: refused.append(name))
+    try:
+        drawing.wiring.run_on(executor)
+        [(_, _, connection)] = listener.accept()
+        drawing.component.target("a defect")
+        connection.send_bytes(pack(1, []))
+        until(executor, lambda: connection.poll(0.0))
+        assert unpack(connection.recv_bytes(), None)[1] == [] and refused == ["target/pose"]
+    finally:
+        listener.close()
 
 
 @pytest.mark.parametrize("make", [participant, lambda executor, kind: created(executor, ArrivalNode, kind)], ids=["lockstep", "arrival"])

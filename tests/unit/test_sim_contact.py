@@ -12,7 +12,7 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_sim.contact_event import ContactState
 from perch_sim.plant import Plant
-from perch_sim.scenario import Adhesion, Disturbance, Target, load_scenario
+from perch_sim.scenario import Adhesion, Disturbance, Start, Target, load_scenario
 
 SCENARIO = load_scenario("surface_90")
 VEHICLE = load_vehicle(SCENARIO.vehicle)
@@ -208,6 +208,18 @@ def test_a_vehicle_does_not_start_within_the_panel(height, panel, refused):
     scenario = dataclasses.replace(SCENARIO, target=Target(inclination_deg=0.0, height=height, distance=1.0, panel_size=(panel, panel)))
     with pytest.raises(ConfigError, match="start.position: .* stand in the panel") if refused else nullcontext():
         plant_of(scenario)
+
+
+@pytest.mark.parametrize("y, vehicle, words", [
+    (2.45, VEHICLE, "start.position: .0, 2.45, 0. m: the vehicle would stand in the wall"),
+    (2.35, VEHICLE, ""),
+    (0.0, dataclasses.replace(VEHICLE, mass=5.0, inertia=(0.02, 0.02, 0.04), speed_max=9e3, perch_offset=0.02),
+     "perch_offset: 0.02 m: the vehicle would stand on its rotors, as its weight presses the plate's felt by 0.025 m"),
+])
+def test_a_vehicle_does_not_start_within_a_wall_nor_on_its_rotors(y, vehicle, words):
+    scenario = dataclasses.replace(SCENARIO, start=Start(position=(0.0, y, 0.0)))
+    with pytest.raises(ConfigError, match=words) if words else nullcontext():
+        Plant(scenario, vehicle, seed=1, start=1_000_000_000)
 
 
 def test_a_panel_smaller_than_its_pad_is_refused():

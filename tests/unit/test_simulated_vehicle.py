@@ -106,6 +106,18 @@ def test_a_command_that_was_overtaken_does_not_undo_the_newer_one():
     assert [line.text for line in seen["log"] if "older than the one before" in line.text]
 
 
+def test_commands_that_are_refused_do_not_make_the_good_ones_look_old():
+    """A stranger that publishes another kind of command, with newer stamps, stops no motors."""
+    flown, _ = vehicle()
+    stamps = []
+    for _ in range(60):
+        flown.advance()
+        stamps.append(flown.time)
+        flown.on_rates_thrust(RatesThrust(flown.time, True, (0.0, 0.0, 0.0), 9.81))
+        flown.on_motor_command(MotorCommand(stamps[max(len(stamps) - 2, 0)], True, (500.0,) * 4))
+    assert flown.simulation.plant.rotor_speed.min() > 300.0 and not flown.simulation.motors.timed_out
+
+
 @pytest.mark.slow
 def test_frames_arrive_with_their_model_and_an_image_that_is_drawn_when_it_is_looked_at():
     flown, seen = vehicle("front")

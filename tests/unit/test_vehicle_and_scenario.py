@@ -164,6 +164,13 @@ def test_files_that_cannot_be_extended_are_refused_with_their_chain(tmp_path, st
     assert words.format(tmp_path) in str(error.value)
 
 
+def test_a_value_that_is_refused_is_not_blamed_on_a_file_that_does_not_have_it(tmp_path):
+    write(tmp_path, base="name: base\ntarget: {distance: 9.0}\n", own="extends: base.yaml\nname: own\n")
+    with pytest.raises(ConfigError) as error:
+        load_scenario(tmp_path / "own.yaml")
+    assert str(error.value) == f"{tmp_path}/own.yaml extends {tmp_path}/base.yaml: target.distance: 9 is outside [0.8, 3.5] m"
+
+
 def test_files_that_a_scenario_names_are_found_beside_it_or_in_the_current_folder(tmp_path, monkeypatch):
     """As those of `extends`, also through a scenario in another folder that extends it."""
     flights, other, here = (tmp_path / name for name in ("my flights", "other", "here"))

@@ -14,7 +14,7 @@ from perch_core.camera import Camera, EquidistantCamera, PinholeCamera
 from perch_core.camera_mount import CameraMount
 from perch_core.config import DEFAULT_BOUNDS, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
-from perch_core.extends import extended_mapping
+from perch_core.extends import load_extended
 from perch_core.sensors import check_quaternion
 
 GRAVITY = 9.81  # standard gravity of paper M [m/s^2]
@@ -241,4 +241,4 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
     Raises:
         ConfigError: no such vehicle, or a value that is refused.
     """
-    return config.from_mapping(Vehicle, extended_mapping("vehicles", name_or_path), vehicle_file(name_or_path))
+    return load_extended(Vehicle, "vehicles", name_or_path)

@@ -17,11 +17,9 @@ import yaml
 from perch_core import config
 from perch_core.errors import ConfigError, PerchError
 from perch_planner.perching_planner import TIME_LIMIT_MAX
-from perch_sim.lockstep import flight_tasks
-from perch_sim.scenario import NODES, Latency, Scenario
+from perch_sim.lockstep import PARTICIPANTS
+from perch_sim.scenario import NODES, Scenario
 
-PARTICIPANTS = frozenset(flight_tasks(Latency()))
-"""Nodes that take part in the simulator's lockstep."""
 ALWAYS = ("description",)
 """Nodes that are started with every scenario."""
 HOST_PARAMETERS = ("lockstep", "lockstep_hold", "use_sim_time")

@@ -106,7 +106,7 @@ class ModelledVio(Component[VioModelParameters]):
         q_WB = tuple(e.q_WB.tolist())
         odometry = OdometryState(
             state.time, tuple(e.p_WB.tolist()), q_WB, rotated(q_WB, e.v_WB.tolist(), -1.0), tuple(state.w_WB_B.tolist()),
-            np.diag(e.pose_variance), np.diag([e.velocity_variance] * 3 + [RATE_VARIANCE] * 3), "odom")
+            e.pose_covariance, np.diag([e.velocity_variance] * 3 + [RATE_VARIANCE] * 3), "odom")
         return inertial, odometry
 
     def _emit(self) -> None:

@@ -24,7 +24,7 @@ from perch_sim.wind import WindField
 
 SUBSTEPS = 4        # Runge-Kutta steps per period: 0.5 ms each
 STEP = CONTROL_PERIOD / SUBSTEPS
-START_DEPTH = 0.01  # to which the vehicle may stand in the panel at the start [m]
+START_DEPTH = 0.01  # to which the vehicle may stand in a surface at the start [m]
 STABLE = 2.78       # greatest (rate of a decay) * (step) at which a Runge-Kutta step of fourth order decays, too
 
 
@@ -58,8 +58,8 @@ class Plant:
             start: time of the initial state [ns].
 
         Raises:
-            ConfigError: the board does not exist, the vehicle would stand in the panel, a disturbance does not suit the vehicle, or
-                the plate is so far from the centre of mass that steps of 0.5 ms cannot follow its hold.
+            ConfigError: the board does not exist, the vehicle would stand in the panel, in a wall or on its rotors, a disturbance does
+                not suit it, or the plate is so far from the centre of mass that steps of 0.5 ms cannot follow its hold.
         """
         self.body = make_body(vehicle, scenario.disturbance)
         if hold_rate(self.body) * STEP > STABLE:
@@ -139,12 +139,15 @@ class Plant:
         return PlantOutput(states, total / SUBSTEPS, tuple(contacts))
 
     def _check_start(self, scenario: Scenario) -> None:
-        """Check that the vehicle does not stand in the panel; a panel flush with the floor gives way as the floor does."""
+        """Check that the vehicle stands on its plate, and in nothing; a panel flush with the floor gives way as the floor does."""
         clearances(self._x, self._x, self.body, self.obstacles.surfaces, 0.0, self._touched)
         for name, (plate, rest, _) in zip(self.obstacles.names, self._touched):
-            if name in ("pad", "panel") and min(plate, rest) < -START_DEPTH:
-                x, y, z = scenario.start.position
-                raise ConfigError("", "start.position", f"({x:g}, {y:g}, {z:g}) m: the vehicle would stand in the panel around the pad")
+            if name == "floor" and rest < 0.0:
+                raise ConfigError(vehicle_file(scenario.vehicle), "perch_offset", f"{self.body.plate_offset:g} m: the vehicle would stand on its "
+                                  f"rotors, as its weight presses the plate's felt by {-plate:.3f} m")
+            if name != "floor" and min(plate, rest) < -START_DEPTH:
+                (x, y, z), place = scenario.start.position, "panel around the pad" if name in ("pad", "panel") else name
+                raise ConfigError("", "start.position", f"({x:g}, {y:g}, {z:g}) m: the vehicle would stand in the {place}")
 
     def _warm_up(self) -> None:
         """Compile the kernels on a copy of the state, so that the first step of a flight in real time is not delayed."""

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from perch_core import config
 from perch_core.arrays import Vector3, Vector4
 from perch_core.catenary import Catenary
 from perch_core.config import choice, label, part, quantity, text
 from perch_core.errors import ConfigError, PerchError
-from perch_core.extends import extended_mapping
+from perch_core.extends import load_extended
 from perch_core.surface import PerchSurface
 
 NODES = {
@@ -278,4 +277,4 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     Raises:
         ConfigError: no such scenario, or a value that is refused.
     """
-    return config.from_mapping(Scenario, extended_mapping("scenarios", name_or_path), str(config.find("scenarios", name_or_path)))
+    return load_extended(Scenario, "scenarios", name_or_path)

@@ -33,6 +33,8 @@ SLOW_STEPS = 5                         # steps from one clock, rotor state or po
 MAX_PENDING_IMAGES = 2                 # images per camera being rendered in real time: a slow machine gets fewer, not older ones
 REAL_TIME_MOTOR_TIMEOUT = 200_000_000  # with a busy operating system in between [ns]
 COMMANDS_MISSED = 0.25                 # share of steps without a new command in a second above which it warns
+COMMANDS = {"rotor_speeds": "motor_command", "rates_and_thrust": "rates_thrust_command", "attitude_and_thrust": "attitude_thrust_command"}
+"""Actuation of a vehicle -> topic of its commands."""
 EXACT = np.zeros((6, 6))               # covariance of the truth
 
 MakeRendering = Callable[[Scenario, int, Collection[str]], Rendering]
@@ -49,9 +51,9 @@ class SimulatedVehicle(Component[VehicleParameters]):
 
     config_type = VehicleParameters
 
-    motor_command = Input(MotorCommand, "motor_command", answered=True)
-    rates_thrust = Input(RatesThrust, "rates_thrust_command", answered=True)
-    attitude_thrust = Input(AttitudeThrust, "attitude_thrust_command", answered=True)
+    motor_command = Input(MotorCommand, COMMANDS["rotor_speeds"], answered=True)
+    rates_thrust = Input(RatesThrust, COMMANDS["rates_and_thrust"], answered=True)
+    attitude_thrust = Input(AttitudeThrust, COMMANDS["attitude_and_thrust"], answered=True)
     pace = Timer(CONTROL_PERIOD)
     imu = Output(ImuSample, "imu/data_raw")
     truth = Output(OdometryState, "ground_truth/odometry")
@@ -89,7 +91,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
             raise
         self.time = self.simulation.time
         self._index = 0                          # steps so far
-        self._last_command = 0                   # newest stamp of a command
+        self._last_command = 0                   # newest stamp of a command that was not refused
         self._pacing: Pacing | None = None       # in real time
         self._broken: set[str] = set()           # cameras without images for the rest of the flight
         self._diagnosed, self._last_counts = self.time, (0, 0)  # time of the last diagnostics; steps and missed commands by then
@@ -148,8 +150,9 @@ class SimulatedVehicle(Component[VehicleParameters]):
         except MotorCommandError as error:
             self._counts["commands_refused"] += 1
             self.log(LogLine("error", str(error), 1.0))
-        if self._last_command < command.stamp <= self.time:
-            self._last_command = command.stamp
+        else:
+            if self._last_command < command.stamp <= self.time:
+                self._last_command = command.stamp
 
     # -- stepping ----------------------------------------------------------------------------------------------------
 
@@ -259,7 +262,7 @@ class SimulatedVehicle(Component[VehicleParameters]):
             level, message = 1, f"{100 * missed / steps:.0f} % of the controller's commands are lost or late"
             self.warn(message, min_interval=5.0)
         if simulation.motors.timed_out:
-            level, message = 1, "motors stopped: no motor_command"
+            level, message = 1, f"motors stopped: no {COMMANDS[simulation.vehicle.actuation.type]}"
         if simulation.plant.crashed:
             level, message = 2, "crashed"
         self.diagnostics(Diagnostics(self.time, values, level, message))

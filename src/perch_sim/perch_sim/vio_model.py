@@ -48,9 +48,15 @@ class VioEstimate(NamedTuple):
     p_WB: np.ndarray        # (3,) [m]
     q_WB: np.ndarray        # xyzw, (4,)
     v_WB: np.ndarray        # (3,) [m/s]
-    pose_variance: np.ndarray   # x, y, z [m^2], about x, y, z of the map [rad^2], (6,)
     velocity_variance: float    # of each axis [m^2/s^2]
     covariance: np.ndarray      # of (p, v, theta), theta a rotation vector in B, with what the drift of yaw makes correlated, (9, 9)
+
+    @property
+    def pose_covariance(self) -> np.ndarray:
+        """Covariance of (position, rotation about W's axes), (6, 6)."""
+        to_pose = np.zeros((6, 9))
+        to_pose[:3, :3], to_pose[3:, 6:] = np.eye(3), so3.quat_to_matrix(self.q_WB)
+        return to_pose @ self.covariance @ to_pose.T
 
 
 class VioModel:
@@ -78,15 +84,12 @@ class VioModel:
         turn = so3.quat_exp(np.array([0.0, 0.0, self._yaw]))
         shake = so3.quat_exp(ATTITUDE_NOISE * draw[4:7])
         age = time - self._first
-        variance = np.concatenate([
-            np.full(3, k.position_noise**2 + k.position_drift**2 * age),
-            np.full(3, ATTITUDE_NOISE**2) + np.array([0.0, 0.0, YAW_DRIFT**2 * age])])
         p = so3.quat_rotate(turn, p_WB) + self._drift + k.position_noise * draw[7:10]
         q = so3.quat_multiply(turn, so3.quat_multiply(shake, q_WB))
         v = so3.quat_rotate(turn, v_WB) + VELOCITY_NOISE * draw[10:13]
         of_yaw = np.array([-p[1], p[0], 0.0, -v[1], v[0], 0.0, *so3.quat_to_matrix(q)[2]])  # e3 x p, e3 x v, R^T e3
-        white = [*variance[:3], *[VELOCITY_NOISE**2] * 3, *[ATTITUDE_NOISE**2] * 3]
-        return VioEstimate(p, q, v, variance, VELOCITY_NOISE**2, np.diag(white) + YAW_DRIFT**2 * age * np.outer(of_yaw, of_yaw))
+        independent = np.repeat([k.position_noise**2 + k.position_drift**2 * age, VELOCITY_NOISE**2, ATTITUDE_NOISE**2], 3)
+        return VioEstimate(p, q, v, VELOCITY_NOISE**2, np.diag(independent) + YAW_DRIFT**2 * age * np.outer(of_yaw, of_yaw))
 
 
 class BiasModel:

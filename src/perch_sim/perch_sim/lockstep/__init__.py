@@ -8,7 +8,7 @@ from perch_sim.lockstep.batches import Arrival
 from perch_sim.lockstep.packet import Codec, Packet
 from perch_sim.lockstep.participant import Answer, LocalParticipant, Participant, local_servers
 from perch_sim.lockstep.schedule import PendingInput, Schedule
-from perch_sim.lockstep.tasks import START, START_DEADLINE, Task, flight_tasks, is_slow
+from perch_sim.lockstep.tasks import PARTICIPANTS, START, START_DEADLINE, Task, flight_tasks, is_slow
 
-__all__ = ["START", "START_DEADLINE", "Answer", "Arrival", "Codec", "LocalParticipant", "Packet", "Participant", "PendingInput",
-           "Schedule", "Task", "flight_tasks", "is_slow", "local_servers"]
+__all__ = ["PARTICIPANTS", "START", "START_DEADLINE", "Answer", "Arrival", "Codec", "LocalParticipant", "Packet", "Participant",
+           "PendingInput", "Schedule", "Task", "flight_tasks", "is_slow", "local_servers"]

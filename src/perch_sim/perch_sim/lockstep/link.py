@@ -12,7 +12,7 @@ import os
 import select
 import socket
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Client, Connection, Listener
 
@@ -21,8 +21,8 @@ from perch_sim.lockstep.packet import Codec, Packet
 
 _BATCH, _PACKET = struct.Struct("<qI"), struct.Struct("<HI")  # stamp [ns] and number of packets; lengths of channel and data [byte]
 _PEER = struct.Struct("3i")                                   # process, user, group
-
 _SEND_LIMIT = struct.pack("ll", 0, 20_000)                    # longest wait for a participant that does not read [s, us]
+_RECEIVE_LIMIT = struct.pack("ll", 10, 0)                     # ... and for the rest of a message that has begun [s, us]
 _LENGTH = struct.Struct("!i")                                 # of a message, as in multiprocessing
 
 
@@ -31,13 +31,25 @@ def address(domain: str, namespace: str) -> str:
     return f"\0perch-lockstep-{os.getuid()}-{domain}-{namespace.strip('/')}"
 
 
-def pack(stamp: int, packets: Sequence[Packet]) -> bytes:
-    """Return a batch, or its results, as bytes."""
-    parts = [_BATCH.pack(stamp, len(packets))]
+def pack(stamp: int, packets: Sequence[Packet], on_failure: Callable[[str, Exception], None] | None = None) -> bytes:
+    """Return a batch, or its results, as bytes.
+
+    Args:
+        stamp: of the batch [ns].
+        packets: in order.
+        on_failure: called with channel and exception for each value that has no message, which is left out; None: it is raised.
+    """
+    parts: list[bytes] = []
     for packet in packets:
-        channel, data = packet.channel.encode(), packet.data
-        parts += (_PACKET.pack(len(channel), len(data)), channel, data)
-    return b"".join(parts)
+        try:
+            channel, data = packet.channel.encode(), packet.data
+        except Exception as error:
+            if on_failure is None:
+                raise
+            on_failure(packet.channel, error)
+        else:
+            parts += (_PACKET.pack(len(channel), len(data)), channel, data)
+    return b"".join((_BATCH.pack(stamp, len(parts) // 3), *parts))
 
 
 def unpack(data: bytes, codec: Codec) -> tuple[int, list[Packet]]:
@@ -91,11 +103,12 @@ class ParticipantListener:
                 with socket.socket(fileno=os.dup(connection.fileno())) as peer:
                     user = _PEER.unpack(peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
                     peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_LIMIT)
+                    peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_LIMIT)
                 if user != os.getuid() or not connection.poll(1.0):
                     raise OSError("not the same user, or silent")
                 greeting = json.loads(connection.recv_bytes(1 << 16))
                 accepted.append((str(greeting["node"]), frozenset(map(str, greeting["inputs"])), connection))
-            except (OSError, EOFError, ValueError, KeyError, TypeError):
+            except (OSError, EOFError, ValueError, KeyError, TypeError, RecursionError):
                 connection.close()
 
     def close(self) -> None:

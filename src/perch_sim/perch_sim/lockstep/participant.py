@@ -126,6 +126,19 @@ def handlers(component: Component[Any]) -> dict[str, Callable[[Any], None]]:
     return found
 
 
+def packet_receiver(component: Component[Any], handle: Callable[[Any], None]) -> Callable[[Packet], None]:
+    """Return a receiver of packets for a handler; bytes that are no message are refused with a warning."""
+    def receive(packet: Packet) -> None:
+        try:
+            value = packet.value
+        except PerchError as error:
+            component.warn(f"{packet.channel} refused: {error}", min_interval=1.0)
+        else:
+            handle(value)
+
+    return receive
+
+
 class LocalParticipant(Participant):
     """A component in this process, which processes a batch when it begins.
 
@@ -170,9 +183,13 @@ class LocalParticipant(Participant):
     # -- batches -----------------------------------------------------------------------------------------------------
 
     def begin(self, now: int, batch: Sequence[Packet]) -> None:
-        """Process a batch, or wait for the goal or the answers that it needs."""
+        """Process a batch, or wait for the goal or the answers that it needs; in a new flight, for all answers of the old one."""
         if now > START_DEADLINE:
             self._await_goal = ""
+        if now < self.now:  # the vehicle has been started again
+            for timer in self._timers:
+                timer[0] = 0
+            self._awaited = [awaited._replace(due=0) for awaited in self._awaited]
         self.now, self._batch, self._begun = now, iter(batch), True
         self._continue_batch()
 

@@ -24,7 +24,7 @@ from perch_core.errors import PerchError
 from perch_core.values import CameraImage
 from perch_sim.lockstep.batches import Arrival, Batch, Slot, first_pending_image, is_lost, is_rendered
 from perch_sim.lockstep.packet import Codec, Packet
-from perch_sim.lockstep.participant import Emissions, Participant, handlers
+from perch_sim.lockstep.participant import Emissions, Participant, handlers, packet_receiver
 from perch_sim.lockstep.tasks import Task
 from perch_sim.timing import CONTROL_PERIOD_NS
 
@@ -85,7 +85,7 @@ class Schedule:
         """
         self.now, self.index = 0, 0
         self._vehicle = cast(Vehicle, vehicle)
-        self._vehicle_handlers = handlers(vehicle)
+        self._vehicle_receivers = {channel: packet_receiver(vehicle, handle) for channel, handle in handlers(vehicle).items()}
         self._emissions = Emissions(vehicle, codec)
         self._slots = {name: Slot(name, task) for name, task in tasks.items()}
         self._fast = [slot for slot in self._slots.values() if slot.task.latency is None]
@@ -134,7 +134,7 @@ class Schedule:
     def _reroute(self) -> None:
         self._routes.clear()
         taken = {channel for slot in self._slots.values() for channel in slot.inputs}
-        taken |= set(self._vehicle_handlers)
+        taken |= set(self._vehicle_receivers)
 
         def is_taken(channel: str) -> bool:
             return channel in taken or _is_latched(channel)
@@ -147,9 +147,8 @@ class Schedule:
     def _receivers(self, channel: str) -> list[Callable[[Packet], None]]:
         receivers: list[Callable[[Packet], None]] = [
             slot.inbox.append for slot in self._slots.values() if channel in slot.inputs]
-        if channel in self._vehicle_handlers:
-            handle = self._vehicle_handlers[channel]
-            receivers.append(lambda packet: handle(packet.value))
+        if channel in self._vehicle_receivers:
+            receivers.append(self._vehicle_receivers[channel])
         if _is_latched(channel):
             receivers.append(self._latch)
         return receivers

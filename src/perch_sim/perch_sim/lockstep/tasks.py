@@ -40,6 +40,10 @@ def flight_tasks(latency: Latency) -> dict[str, Task]:
     }
 
 
+PARTICIPANTS = tuple(flight_tasks(Latency()))
+"""Names of all possible participants."""
+
+
 def is_slow(name: str) -> bool:
     """Return whether the results of a participant take effect later than at its step."""
     task = flight_tasks(Latency()).get(name)

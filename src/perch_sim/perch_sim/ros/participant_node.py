@@ -35,6 +35,7 @@ ANSWER_TIMEOUT = 50.0  # an answer this late was lost with its server: more than
 WARN_AFTER = 3.0       # a vehicle that is missing, or a server that has not answered, for so long is reported [s]
 WARN_REPEAT = 10.0     # between reports of a missing vehicle [s]
 BURST = 40             # batches between which other events are processed
+UNTAKEN = ("vio/debug_image",)  # outputs that no participant takes: each value would be drawn and sent for nobody
 OBSERVED = ("/diagnostics", "/tf", "/tf_static", "robot_description")  # taken on arrival by components that only store messages
 
 
@@ -87,6 +88,7 @@ class ParticipantNode(ComponentNode):
             return
         if is_slow(self.get_name()):
             priority.lower_priority()  # steps take priority over slow work
+        self.participant.set_channel_filter(lambda channel: channel not in UNTAKEN)
         self._where = address(os.environ.get("ROS_DOMAIN_ID", "0"), self.get_namespace())
         self._check_timer = self.create_timer(CHECK_PERIOD, self._finish_batch, clock=self._steady)
         self._check_timer.cancel()
@@ -132,14 +134,17 @@ class ParticipantNode(ComponentNode):
             return
         packets = self.participant.results()
         if packets is None:
-            if self._check_timer.is_canceled():
+            # The vehicle sends nothing before it has the results: it has ended. Answers come or are given up, but goals may never come.
+            if self._connection_poll.ready(0.0) and all(request.answer.done() for request in self._open_requests):
+                self._disconnect()
+            elif self._check_timer.is_canceled():
                 self._check_timer.reset()
             return
         self._busy = False
         waited = not self._check_timer.is_canceled()
         self._check_timer.cancel()
         try:
-            self._vehicle.send_bytes(pack(0, packets))
+            self._vehicle.send_bytes(pack(0, packets, self.log_refusal))
         except OSError:
             self._disconnect()
             return
@@ -157,6 +162,7 @@ class ParticipantNode(ComponentNode):
     def _disconnect(self) -> None:
         """Close the connection to a vehicle that has ended; another one may be found later."""
         self._busy = False
+        self._check_timer.cancel()
         self._connection_poll.remove(self._vehicle)
         self._vehicle, self._without_vehicle_since = None, time.monotonic()
 

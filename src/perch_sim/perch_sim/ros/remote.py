@@ -10,18 +10,26 @@ from perch_core.ros import topics
 from perch_sim.lockstep import Packet, Participant
 from perch_sim.lockstep.link import NonBlockingSender, pack, unpack
 
+DISCONNECTED = "has disconnected"
+
 
 class RemoteParticipant(Participant):
     """Sends batches over a connection, and receives results.
 
     Attributes:
-        closed: whether the process has ended or has closed the connection.
+        ended: why the connection has ended, for the log; empty: it has not.
     """
 
-    def __init__(self, name: str, inputs: frozenset[str], connection: Connection) -> None:
+    def __init__(self, name: str, inputs: frozenset[str], connection: Connection, on_failure: Callable[[str, Exception], None]) -> None:
+        """
+        Args:
+            name, inputs: see `Participant`.
+            connection: to its process.
+            on_failure: called with channel and exception for each value that has no message, which is not sent.
+        """
         self.name, self.inputs, self.connection = name, inputs, connection
-        self.closed = False
-        self._sender = NonBlockingSender(connection)
+        self.ended = ""
+        self._sender, self._on_failure = NonBlockingSender(connection), on_failure
         self._results: list[Packet] | None = None
         self._is_taken: Callable[[str], bool] = lambda channel: True
 
@@ -29,27 +37,31 @@ class RemoteParticipant(Participant):
         """Send a batch."""
         self._results = None
         try:
-            self._sender.send(pack(now, batch))
+            self._sender.send(pack(now, batch, self._on_failure))
         except OSError:
-            self.closed = True
+            self.ended = DISCONNECTED
 
     def flush(self) -> None:
         """Send the rest of a batch to a process that did not read all of it."""
         try:
             self._sender.flush()
         except OSError:
-            self.closed = True
+            self.ended = DISCONNECTED
 
     def close(self) -> None:
         """Close the sending side of the connection."""
         self._sender.close()
 
     def receive(self) -> None:
-        """Receive the results of a batch; set `closed` if the connection has ended."""
+        """Receive the results of a batch; set `ended` if the connection has ended, or if what it sends is no batch."""
         try:
             _, packets = unpack(self.connection.recv_bytes(), topics)
-        except (OSError, EOFError, PerchError):
-            self.closed = True
+        except BlockingIOError:
+            self.ended = "is disconnected: it has stopped within a message"
+        except (OSError, EOFError):
+            self.ended = DISCONNECTED
+        except PerchError as error:
+            self.ended = f"is disconnected: {error}"
         else:
             self._results = [packet for packet in packets if self._is_taken(packet.channel)]
 

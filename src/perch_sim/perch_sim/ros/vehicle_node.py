@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from perch_core.component import Component
+from perch_core.component import Component, Input, ports
 from perch_core.ros import topics
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import SHARED_TOPICS
@@ -86,17 +86,20 @@ class VehicleNode(ComponentNode):
     # -- participants ------------------------------------------------------------------------------------------------
 
     def _accept_participants(self) -> None:
-        """Accept participants that connect; one that reconnects replaces its former connection."""
+        """Accept participants that connect. A name has one connection: while it lasts, further ones are refused."""
         for name, inputs, connection in self._listener.accept():
             if name not in self._expected:
                 self.warn_once(f"lockstep: {name!r} tried to connect but is not in the parameter participants: ignored")
                 connection.close()
                 continue
             former = self._remote.get(name)
+            if name in self.wiring.participants or former is not None and name not in self._disconnected:
+                self.warn_once(f"lockstep: another {name!r} tried to connect: ignored")
+                connection.close()
+                continue
             if former is not None:
-                self._links.remove(former.connection)
                 former.close()
-            one = self._remote[name] = RemoteParticipant(name, inputs, connection)
+            one = self._remote[name] = RemoteParticipant(name, inputs, connection, self.log_refusal)
             self._links.add(connection)
             self._dropped.discard(name)
             self._disconnected.discard(name)
@@ -112,10 +115,14 @@ class VehicleNode(ComponentNode):
         for connection in connections:
             one = next(remote for remote in self._remote.values() if remote.connection is connection)
             one.receive()
-            if one.closed:
+            if one.ended:
                 self._links.remove(connection)
-                self._disconnected.add(one.name)
-                self.get_logger().error(f"lockstep: {one.name} has disconnected")
+                self.get_logger().error(f"lockstep: {one.name} {one.ended}")
+                if self._started:
+                    self._disconnected.add(one.name)
+                else:  # it is missing again
+                    del self._remote[one.name]
+                    one.close()
         return bool(connections)
 
     def _missing(self) -> list[str]:
@@ -255,7 +262,7 @@ class VehicleNode(ComponentNode):
     def _warn_foreign_publishers(self) -> None:
         """Warn of nodes that publish on topics of the flight without taking part; their messages are ignored."""
         inputs = set().union(*(one.inputs for one in (*self._remote.values(), *self.wiring.participants.values())))
-        inputs = (inputs - set(SHARED_TOPICS)) | {"motor_command"}
+        inputs = (inputs - set(SHARED_TOPICS)) | {port.channel(self.component) for port in ports(type(self.component), Input)}
         members = {f"{self.get_namespace().rstrip('/')}/{name}" for name in (*self._expected, self.get_name())}
         for channel in sorted(inputs):
             for publisher in foreign_publishers(self, self.resolve_topic_name(channel), members):
