@@ -6,6 +6,7 @@ import csv
 import json
 import subprocess
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -212,6 +213,21 @@ def test_no_cause_is_looked_for_after_the_deadline(planner: PowerlinePlanner, mo
     with pytest.raises(PlanningRefusal, match="no time was left to search for the cause"):
         planner.plan(replace(near_the_ground(), deadline=1e-3))
     assert phases == ["gauss_newton"]
+
+
+def test_each_search_for_the_cause_gets_the_time_that_is_left(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, deadlines = count(), []
+
+    def refuse(_: search.Search, task: search.Task, *args: object, **kwargs: object) -> None:
+        deadlines.append(task.request.deadline)
+        raise search.NotConverged(task.name, "", 0.1)
+
+    monkeypatch.setattr(relaxation, "perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr(search.Search, "solve_and_check", refuse)
+    with pytest.raises(PlanningRefusal, match="no single limit"):
+        relaxation.plan_perch(search.Search(VEHICLE, planner.settings, planner.formulation, planner.solver), replace(REQUEST, deadline=60.0),
+                              REQUEST.perch, 60.0)
+    assert deadlines == [60.0, 60.0, 59.0, 58.0, 57.0, 56.0, 55.0]
 
 
 def test_a_perch_found_without_a_limit_that_it_keeps_is_a_plan(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
