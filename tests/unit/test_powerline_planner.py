@@ -21,6 +21,7 @@ from perch_core.rotor_model import P, Q, V
 from perch_core.values import AtEnd
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem, relaxation, search, service
+from perch_planner.powerline.plan import Manoeuvre, PowerlinePlan
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.report import write_report
@@ -115,6 +116,14 @@ def test_a_perch_after_which_no_recovery_is_found_is_given_without_one() -> None
     assert answer.success and answer.at_end == AtEnd.CONTACT and answer.recovery_start < 0.0
     assert "without recovery: no recovery" in answer.message
     assert plan_answer(answer) == Refusal(answer.message)
+
+
+@pytest.mark.parametrize("duration", [16.5, 18.0, 30.0])
+def test_the_longest_plan_has_no_more_points_than_the_controller_takes(planner: PowerlinePlanner, duration: float) -> None:
+    n = round(1e3 * duration)
+    part = Manoeuvre(np.linspace(0.0, duration, n + 1), np.tile(REQUEST.start, (n + 1, 1)), np.zeros((n + 1, 4)), (), 30, "", 0, 0.0, 0.0, 0.0)
+    answer = service.plan_response(PowerlinePlan(part, part), planner.solver.model, 0)
+    assert not isinstance(plan_answer(answer), Refusal) and answer.trajectory.duration == pytest.approx(2.0 * duration)
 
 
 def test_a_recovery_keeps_away_from_the_wire_that_it_left(planner: PowerlinePlanner, planned: PlannedProblem) -> None:
