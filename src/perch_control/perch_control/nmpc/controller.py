@@ -66,7 +66,8 @@ class NmpcController(Law):
         self._low, self._high = np.zeros((N, INPUTS)), np.zeros((N, INPUTS))
         self._x_low, self._x_high, self._price = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n)
         self._dx, self._du, self._work = np.zeros((N + 1, n)), np.zeros((N, INPUTS)), Workspace(N, n)
-        self._warm, self._body_rates = False, (0.0, 0.0, 0.0)
+        self._warm = False
+        self._body_rates: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._line_time = 0.0
         self._lines: tuple[tuple[float, ...], ...] = ()
         self._update_weights()
