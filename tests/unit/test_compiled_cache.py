@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from perch_core import compiled
+from perch_core.errors import PerchError
 
 SOURCE = "int answer(void) { return %d; }"
 
@@ -49,6 +50,12 @@ def test_two_processes_at_once_get_the_same_library(cache: Path) -> None:
 def test_a_source_that_does_not_compile_says_so() -> None:
     with pytest.raises(RuntimeError, match="cannot compile test"):
         compiled.library("test", "int answer(void) { return }")
+
+
+def test_a_cache_that_cannot_be_written_says_so(cache: Path) -> None:
+    cache.write_text("not a folder")
+    with pytest.raises(PerchError, match="cannot be written: .*cache.*; set PERCH_CACHE"):
+        compiled.library("test", SOURCE % 1)
 
 
 def test_compilation_can_be_turned_off(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from closed_loop.plant import Disturbances
 from oracles import rigid_body
 from perch_control.admission import AtEnd, Order
 from perch_control.geometric import GeometricController, packed_vehicle
+from perch_control.guidance import Hold
 from perch_control.l1 import L1Augmentation
 from perch_control.modes import State
 from perch_control.monitors import reference_tilt_deg
@@ -23,7 +24,7 @@ from perch_control.nmpc.controller import LINE_RAMP
 from perch_control.nmpc.linearisation import Linearisation
 from perch_control.nmpc.model import StageLayout, stage
 from perch_control.nmpc.reference_rows import ReferenceRows, reference_row
-from perch_control.reference import FlatReference, SampledReference
+from perch_control.reference import FlatReference, SampledReference, Setpoint
 from perch_control.rotor_lag import RotorEstimate, approached, lag_behind, leading_command
 from perch_core import so3
 from perch_core.compiled import compiler
@@ -269,6 +270,21 @@ def test_a_body_rate_out_of_all_reason_leaves_the_commands_finite():
         flight.step(0.5)
     assert np.isfinite([command.rotor_speed for command in flight.motors]).all()
     assert flight.component.flight.law.failures > 0 and flight.state is State.HOVERING
+
+
+@pytest.mark.parametrize("rate", [6.0, 15.0, 30.0, 60.0])
+def test_a_wrong_body_rate_in_a_few_samples_is_forgotten(rate):
+    """An iterate that has followed it turns once about, where the optimum is another one: the vehicle would spin for a second."""
+    law, source, rng = predictive(), Hold(Setpoint((0.0, 0.0, 1.0))), np.random.default_rng(3)
+    speeds = (math.sqrt(SNAPDRAGON.hover_thrust / 4.0 / SNAPDRAGON.thrust_coefficient),) * 4
+    reference = SimpleNamespace(source=source, elapsed=0.0, setpoint=source.setpoint)
+    for samples in (1, 2, 3) * 5:
+        w = rng.normal(size=3)
+        w *= rate / np.linalg.norm(w)
+        for rates, number in (((0.0, 0.0, 0.0), 5), (tuple(w.tolist()), samples), ((0.0, 0.0, 0.0), 20)):
+            for _ in range(number):
+                out = law.control((0.0, 0.0, 1.0, *(0.0,) * 6, 1.0, *rates), reference, RotorEstimate(speeds, speeds))
+        np.testing.assert_allclose(out.rotor_thrust, SNAPDRAGON.hover_thrust / 4.0, rtol=0.02)
 
 
 @pytest.mark.parametrize("law", ["geometric", "nmpc"])

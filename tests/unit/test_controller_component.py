@@ -420,6 +420,18 @@ def test_a_map_of_the_future_is_ignored_with_a_word_and_an_old_one_is_taken(ahea
     assert ("in the future" in flight.said) == said
 
 
+def test_of_a_map_that_is_published_once_the_lines_near_the_vehicle_are_used_wherever_it_flies():
+    params = parameters(type="nmpc")
+    flight = Flight(100.0, replace(params, nmpc=replace(params.nmpc, lines=replace(params.nmpc.lines, collision=1e-6))))
+    ys = (3.0, 4.0, 5.0, 90.0, 91.0, 92.0)
+    lines = tuple(MappedPowerline(k, (-9.0, y, 2.0), (9.0, y, 2.0), 0.01, np.eye(3), 0.1, 3) for k, y in enumerate(ys))
+    flight.component.on_powerlines(PowerlineMap(0, lines, False, ""))  # before any odometry
+    for y, near in ((0.0, {3.0, 4.0, 5.0}), (95.0, {90.0, 91.0, 92.0})):
+        flight.plant.p = np.array([0.0, y, 0.0])
+        flight.step(2.2)
+        assert {line[1] for line in flight.component.flight.law._lines} == near
+
+
 # -- laws and parameters -----------------------------------------------------------------------------------------------
 
 

@@ -17,6 +17,7 @@ from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import guess
 from perch_planner.powerline.certificate import certify, certify_end
 from perch_planner.powerline.flight import simulate
+from perch_planner.powerline.picture import SideView
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 from perch_planner.powerline.settings import PowerlineSettings
 from perch_planner.powerline.validation import check_request
@@ -188,3 +189,11 @@ def test_fast_turning_and_overdriven_starts_are_refused() -> None:
     fast[11], overdriven[13] = 9.0, 12.0
     assert "9.00 rad/s" in str(refusal(start=fast))
     assert "12.00 N" in str(refusal(start=overdriven))
+
+
+@pytest.mark.parametrize("start", [[0.0, 0.0, 4.0], [4.0, 0.0, 7.0]])
+def test_a_perch_on_a_vertical_wire_is_drawn_from_the_side(start: list[float]) -> None:
+    view = SideView(Segment([4.0, 0.0, 4.0], [0.0, 0.0, 1.0], 2.0, 0.03), np.array(start))
+    outline = view.body(hover_state(MODEL, np.array([3.8, 0.0, 4.0]), LEVEL), VEHICLE.body_radii)
+    np.testing.assert_allclose(np.ptp(outline, axis=0), 2.0 * np.array(VEHICLE.body_radii)[[0, 2]], rtol=0.01)
+    np.testing.assert_allclose(view(np.array([4.0, 0.0, 6.0])), [4.0 - start[0], 6.0])

@@ -64,6 +64,15 @@ def test_perception_cost_grows_as_the_camera_turns_away_even_past_the_line() -> 
     assert np.all(np.diff(costs[1:]) > 0.05)
 
 
+@pytest.mark.parametrize("direction", [[0, 1, 0], [0.6, 0.8, 0]])
+def test_a_start_with_its_camera_exactly_below_a_line_has_a_cost_with_derivatives(direction: list[float]) -> None:
+    """[P:eq9] has a pole there; with NaN at the first node fatrop does not return."""
+    x, line = state([4.0, 0, 3.0]), line_parameters(Segment([4.0, 0, 4.2], direction, 2.0, 0.03))
+    x[3:7] = so3.quat_exp([0, 0, np.arctan2(-direction[0], direction[1])])
+    for name, multiplier in (("perception", []), ("perception_jac", []), ("perception_hess", [1.0]), ("perception_gauss_newton", [1.0])):
+        assert np.isfinite(np.array(STAGES.functions[name](x, line, [50.0, 100.0, 100.0], *multiplier))).all(), name
+
+
 def test_gauss_newton_has_the_gradient_and_never_bends_down() -> None:
     rng, line, weights = np.random.default_rng(4), line_parameters(LINE), [50.0, 100.0, 100.0]
     sparsity = STAGES.hessian["perception"]

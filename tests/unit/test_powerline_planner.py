@@ -6,6 +6,7 @@ import csv
 import json
 import subprocess
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from perch_core.rotor_model import P, Q, V
 from perch_core.values import AtEnd
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import problem, relaxation, search, service
+from perch_planner.powerline.plan import Manoeuvre, PowerlinePlan
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.problem import PlannedProblem
 from perch_planner.powerline.report import write_report
@@ -114,6 +116,14 @@ def test_a_perch_after_which_no_recovery_is_found_is_given_without_one() -> None
     assert answer.success and answer.at_end == AtEnd.CONTACT and answer.recovery_start < 0.0
     assert "without recovery: no recovery" in answer.message
     assert plan_answer(answer) == Refusal(answer.message)
+
+
+@pytest.mark.parametrize("duration", [16.5, 18.0, 30.0])
+def test_the_longest_plan_has_no_more_points_than_the_controller_takes(planner: PowerlinePlanner, duration: float) -> None:
+    n = round(1e3 * duration)
+    part = Manoeuvre(np.linspace(0.0, duration, n + 1), np.tile(REQUEST.start, (n + 1, 1)), np.zeros((n + 1, 4)), (), 30, "", 0, 0.0, 0.0, 0.0)
+    answer = service.plan_response(PowerlinePlan(part, part), planner.solver.model, 0)
+    assert not isinstance(plan_answer(answer), Refusal) and answer.trajectory.duration == pytest.approx(2.0 * duration)
 
 
 def test_a_recovery_keeps_away_from_the_wire_that_it_left(planner: PowerlinePlanner, planned: PlannedProblem) -> None:
@@ -212,6 +222,21 @@ def test_no_cause_is_looked_for_after_the_deadline(planner: PowerlinePlanner, mo
     with pytest.raises(PlanningRefusal, match="no time was left to search for the cause"):
         planner.plan(replace(near_the_ground(), deadline=1e-3))
     assert phases == ["gauss_newton"]
+
+
+def test_each_search_for_the_cause_gets_the_time_that_is_left(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, deadlines = count(), []
+
+    def refuse(_: search.Search, task: search.Task, *args: object, **kwargs: object) -> None:
+        deadlines.append(task.request.deadline)
+        raise search.NotConverged(task.name, "", 0.1)
+
+    monkeypatch.setattr(relaxation, "perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr(search.Search, "solve_and_check", refuse)
+    with pytest.raises(PlanningRefusal, match="no single limit"):
+        relaxation.plan_perch(search.Search(VEHICLE, planner.settings, planner.formulation, planner.solver), replace(REQUEST, deadline=60.0),
+                              REQUEST.perch, 60.0)
+    assert deadlines == [60.0, 60.0, 59.0, 58.0, 57.0, 56.0, 55.0]
 
 
 def test_a_perch_found_without_a_limit_that_it_keeps_is_a_plan(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:

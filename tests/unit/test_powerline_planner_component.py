@@ -24,7 +24,7 @@ from perch_planner import powerline_planner
 from perch_planner.powerline import problem
 from perch_planner.powerline.planner import PowerlinePlanner
 from perch_planner.powerline.service import PowerlinePlanError
-from perch_planner.powerline.settings import PowerlineSettings
+from perch_planner.powerline.settings import Margins, PowerlineSettings
 from perch_planner.powerline_planner import PowerlinePlannerComponent, PowerlinePlannerParameters
 from unit.planner_asker import Asked
 
@@ -268,3 +268,11 @@ def test_parameters_that_cannot_be_are_refused(changes: dict, words: str) -> Non
         PowerlinePlannerComponent(PowerlinePlannerParameters(**changes))
     with pytest.raises(ConfigError, match=words):  # as scripts/plan.py asks
         PowerlinePlanner(load_vehicle(changes.get("vehicle", "rpg")), PowerlineSettings(camera=changes.get("camera", "front")))
+
+
+@pytest.mark.parametrize(("margins", "words"), [(dict(thrust=4.5), "margins.thrust: .* nothing is left"), (dict(body_rate=4.0), "margins.body_rate: 4 rad/s")])
+def test_margins_that_leave_nothing_of_a_vehicles_limits_are_refused(margins: dict, words: str) -> None:
+    """With a body rate of 0 fatrop does not return; below 0 it would be a limit again."""
+    settings = PowerlineSettings(margins=Margins(**margins))
+    with pytest.raises(ConfigError, match=words):
+        settings.check(replace(load_vehicle("rpg"), body_rate_max=4.0))

@@ -172,8 +172,12 @@ class Assembly:
                      float(order.recovery_start))
 
     def set_lines(self, segments: Sequence[Segment]) -> None:
-        """Pass the map of powerlines to the laws that use it."""
+        """Take the map of powerlines."""
         self._segments = segments
+        self.choose_lines()
+
+    def choose_lines(self) -> None:
+        """Pass the lines of the map that are near the vehicle now to the laws that use them."""
         for law in self.laws.values():
             self._update_lines(law)
 

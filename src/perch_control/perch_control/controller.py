@@ -87,6 +87,7 @@ class Controller(Component[ControllerParameters]):
         self._command_stamp = 0            # of the last command to the vehicle [ns]
         self._statuses = self._references = self._diagnoses = self._steps = 0
         self._due = 0                      # time since then at which the next periodic output is due [ns]
+        self._map_received = False         # since the last diagnostics
         self._silent = False               # whether IMU or watchdog are answered, as odometry is missing
 
     def warm_up(self) -> None:
@@ -216,6 +217,7 @@ class Controller(Component[ControllerParameters]):
             return
         try:
             self._assembly.set_lines([line.segment for line in lines.lines])
+            self._map_received = True
         except PerchError as error:
             self.warn(f"powerlines: {error}: ignored", min_interval=1.0)
 
@@ -299,6 +301,9 @@ class Controller(Component[ControllerParameters]):
 
     def _diagnose(self, stamp: int) -> None:
         flight = self.flight
+        if not self._map_received:  # it may be published only once, even before odometry; the vehicle moves among its lines
+            self._assembly.choose_lines()
+        self._map_received = False
         values = {"state": flight.state.name, "controller": flight.law_name, "steps": self._steps,
                   "odometry_age_s": float(min(flight.odometry_age, 1e6)), "rotor_ratio": flight.health.ratio,
                   "law_failures": flight.law.failures}

@@ -16,6 +16,8 @@ import tempfile
 from functools import lru_cache
 from pathlib import Path
 
+from perch_core.errors import PerchError
+
 FLAGS = ("-O2", "-march=native", "-ffp-contract=off", "-fPIC", "-shared")
 
 
@@ -57,6 +59,7 @@ def library(name: str, source: str, flags: tuple[str, ...] = FLAGS) -> Path | No
         The shared library, or None without a compiler or with PERCH_COMPILE=0.
 
     Raises:
+        PerchError: the cache cannot be written.
         RuntimeError: the compiler failed; its first lines are in the message.
     """
     found = None if os.environ.get("PERCH_COMPILE") == "0" else compiler()
@@ -66,9 +69,14 @@ def library(name: str, source: str, flags: tuple[str, ...] = FLAGS) -> Path | No
     product = cache_folder() / f"{name}_{hashlib.sha256(key.encode()).hexdigest()[:24]}.so"
     if product.is_file():
         return product
-    product.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=product.parent) as folder:
-        code, object_file = Path(folder, "code.c"), Path(folder, "code.so")
+    try:
+        product.parent.mkdir(parents=True, exist_ok=True)
+        folder = tempfile.TemporaryDirectory(dir=product.parent)
+    except OSError as error:
+        raise PerchError(f"the cache of compiled code cannot be written: {error}; set PERCH_CACHE to a folder that can be, or "
+                         "PERCH_COMPILE to 0") from error
+    with folder as path:
+        code, object_file = Path(path, "code.c"), Path(path, "code.so")
         code.write_text(source)
         answer = subprocess.run([found[0], *flags, str(code), "-o", str(object_file), "-lm"],
                                 capture_output=True, text=True, check=False)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from math import isfinite
+from math import dist, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perch_control.geometric import GeometricController, packed_vehicle
+from perch_control.geometric.controller import ACCELERATION_MAX
 from perch_control.law import NO_COMPENSATION, ControlOutput, Law
 from perch_control.nmpc.condensing import solve_condensed
 from perch_control.nmpc.iteration import apply, begin, finish, first_command, input_bounds
@@ -35,13 +36,14 @@ _TERMINAL = 4.0          # factor of the state weights at the last node, for wha
 _THRUST_RATE_WEIGHT = 0.002  # of the rotor thrusts' rates where these are the inputs: keeps the QP strictly convex [s^2/N^2]
 _LINE_MARGIN = 0.3       # scaled clearance below which the collision term acts, to act before the line is reached
 LINE_RAMP = 3.0          # line terms grow to their weights over so long: at once they would be a jump of the command [s]
+_RATE_JUMP = 5.0         # of the body rates, beyond their motion: an iterate that follows it may turn about and not back [rad/s]
 _ACTIVE_SETS = 12        # tried in one period before the dense QP is solved
 _FAR_LINE = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 1.0, 0.01)
 
 
 class NmpcController(Law):
     """Predictive control law; owns the iterate (states and inputs over the horizon). It falls back to the geometric law where the
-    QP fails, and for references that are guidance by state (a recovery)."""
+    QP fails or the body rates jump, and for references that are guidance by state (a recovery)."""
 
     name = "nmpc"
     slow = True
@@ -65,6 +67,7 @@ class NmpcController(Law):
         self._x_low, self._x_high, self._price = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n)
         self._dx, self._du, self._work = np.zeros((N + 1, n)), np.zeros((N, INPUTS)), Workspace(N, n)
         self._warm = False
+        self._body_rates: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._line_time = 0.0
         self._lines: tuple[tuple[float, ...], ...] = ()
         self._update_weights()
@@ -157,7 +160,10 @@ class NmpcController(Law):
         ramps = self.settings.ramps and left >= _NODES * self._dt
         ahead = 0.0 if self.thrust_states else self.fallback.lag
         self._rows.fill(reference.source, reference.elapsed + ahead, self._spacing, self._R)
+        before, self._body_rates = self._body_rates, state[10:13]
         try:
+            if self._warm and dist(before, self._body_rates) > _RATE_JUMP + ACCELERATION_MAX * self.period:
+                raise QpFailure("the body rates have jumped")
             speed, wrench, reached = self._iterate(state, rotors, compensation, ahead, ramps)
             if not all(map(isfinite, speed)):
                 raise QpFailure("the iterate diverged")

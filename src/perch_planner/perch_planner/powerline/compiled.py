@@ -30,7 +30,7 @@ def load(stages: StageFunctions) -> tuple[StageFunctions, bool]:
         The functions, and whether they are compiled.
 
     Raises:
-        RuntimeError: the compiler failed; its first lines are in the message.
+        PerchError, RuntimeError: as `perch_core.compiled.library`.
     """
     library = compiled.library("powerline", _source(stages.functions), FLAGS)
     if library is None:

@@ -22,10 +22,11 @@ CAMERA_AXIS_LENGTH = 0.5  # of the drawn camera axis [m]
 
 
 class SideView:
-    """Projection on the vertical plane perpendicular to the target line."""
+    """Projection on the vertical plane perpendicular to the target line, for a vertical one on the plane from the start to it."""
 
     def __init__(self, line: Segment, start: np.ndarray) -> None:
-        horizontal = np.cross(line.direction, [0.0, 0.0, 1.0])
+        towards = (line.centre - start) * (1.0, 1.0, 0.0)
+        horizontal = next(v for v in (np.cross(line.direction, [0.0, 0.0, 1.0]), towards, np.array([1.0, 0.0, 0.0])) if np.linalg.norm(v) > 1e-6)
         horizontal /= np.linalg.norm(horizontal)
         self.right_W = horizontal if horizontal @ (line.centre - start) > 0 else -horizontal
         self.origin = start

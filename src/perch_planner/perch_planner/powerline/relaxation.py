@@ -75,10 +75,12 @@ def _relaxed(search: Search, task: Task, refusal: NotConverged, end_time: float)
     """Return a refusal with the first limit whose removal soon yields a perch, or that perch where it keeps all limits."""
     explanation = f"no single limit was identified as the cause (tried: {', '.join(relaxation.label for relaxation in RELAXATIONS)})"
     for relaxation in RELAXATIONS:
-        if perf_counter() + refusal.attempt_time > end_time:
-            explanation = f"no time was left to search for the cause; allow more than {task.request.deadline:g} s"
+        remaining = end_time - perf_counter()
+        if remaining < refusal.attempt_time:
+            explanation = "no time was left to search for the cause; allow more time"
             break
-        request, settings, vehicle = relaxation.relaxed(replace(task.request, solver="fatrop"), search.settings, search.vehicle)
+        trial = replace(task.request, solver="fatrop", deadline=remaining)
+        request, settings, vehicle = relaxation.relaxed(trial, search.settings, search.vehicle)
         relaxed_search = replace(search, settings=settings, vehicle=vehicle)
         try:
             found = relaxed_search.solve_and_check(relaxed_search.perch(request, task.goal), "trial", guesses=1)

@@ -14,6 +14,7 @@ from perch_planner.powerline import plan
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
 
 SAMPLE_STEP = 0.004   # spacing of the trajectory's points [s]
+SAMPLES = 0.8 * limits.SAMPLES_MAX  # about so many points at most, of a plan that lasts long
 CONTACT_TIME = 0.1    # how long the grip is awaited after a perch without recovery, where the mission says nothing [s]
 POINT_REACH = 3.0
 """Greatest distance of a perch point from its line segment; a point farther away is refused [m]."""
@@ -87,7 +88,8 @@ def plan_response(found: plan.PowerlinePlan, model: RotorModel, start: int) -> P
         model: of the vehicle, for the accelerations.
         start: stamp of the trajectory's start [ns].
     """
-    trajectory = found.trajectory(model, seconds(start), SAMPLE_STEP).normalised()
+    step = max(SAMPLE_STEP, sum(part.duration for part in found.parts) / SAMPLES)
+    trajectory = found.trajectory(model, seconds(start), step).normalised()
     perch, recovery = found.perch, found.recovery
     at_end, recovery_start = AtEnd.CONTACT, -1.0
     if recovery is not None:

@@ -61,9 +61,15 @@ class PowerlineSettings:
         """Refuse a vehicle for which these settings cannot be used.
 
         Raises:
-            ConfigError: the vehicle lacks the camera or `thrust_rate_max`.
+            ConfigError: the vehicle lacks the camera or `thrust_rate_max`, or the margins leave nothing of its thrust or body rate.
         """
         if self.camera not in vehicle.mounts:
             raise ConfigError("powerline_planner", "camera", f"vehicle {vehicle.name} has no camera {self.camera!r}")
         if not isfinite(vehicle.thrust_rate_max):
             raise ConfigError("powerline_planner", "vehicle", f"{vehicle.name} has no thrust_rate_max, which [P:eq14g] needs")
+        low, high = vehicle.thrust_min + self.margins.thrust, self.thrust_share * vehicle.thrust_max - self.margins.thrust
+        if not low < high:
+            raise ConfigError("powerline_planner", "margins.thrust", f"of a rotor of {vehicle.name} nothing is left: [{low:g}, {high:g}] N")
+        if not self.margins.body_rate < vehicle.body_rate_max:
+            raise ConfigError("powerline_planner", "margins.body_rate", f"{self.margins.body_rate:g} rad/s is not below the largest body rate "
+                                                                        f"of {vehicle.name}, {vehicle.body_rate_max:g} rad/s")

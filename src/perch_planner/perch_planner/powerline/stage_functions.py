@@ -25,6 +25,7 @@ STAGE_STATES = STATES + 1  # the duration T is a constant state
 SUB_STEPS = 2  # one RK4 step per T/30 drifts up to 22 mm when re-integrated; two stay below 0.7 mm
 LINE_SIZE = 8  # centre (3), direction (3), radius, half length
 SEGMENT_AIM = 0.5  # share of the segment's half length within which the soft constraint keeps the centred point
+POLE = 1e-18  # of n_x^2 + n_y^2 of the line in [P:eq9], below which it has no value [m^2]
 RUN_WEIGHTS, PERCEPTION_WEIGHTS, END_WEIGHTS, REFERENCE = 4, 3, 6, 12
 
 
@@ -85,6 +86,15 @@ def _violation(h: Scalar) -> Scalar:
     return ca.fmax(0, -h)
 
 
+def _off_pole(n_I: Vector) -> Vector:
+    """`n_I`, with another value at the pole of [P:eq9, P:eq13], where the line is beside the camera, in the plane of its x and y axes.
+
+    Where a start has its camera exactly below or above the line, the solver would get NaN at the first node, and fatrop not return.
+    As the start is fixed, the value there does not matter.
+    """
+    return ca.if_else(n_I[0] * n_I[0] + n_I[1] * n_I[1] < POLE, 1.0, n_I[0]), n_I[1], n_I[2]
+
+
 def _perception_residuals(model: StageModel, x: Vector, line: Vector) -> Vector:
     """Residuals of the perception cost: reprojection, cheirality, segment visibility. [uses P:eq9, P:eq12, P:eq13]
 
@@ -94,6 +104,7 @@ def _perception_residuals(model: StageModel, x: Vector, line: Vector) -> Vector:
     """
     o_C, l_C = lines.line_in_camera(x[P], x[Q], line[0:3], line[3:6], model.p_BC, model.q_BC)
     n_I, l_I = lines.image_line(o_C, l_C)
+    n_I = _off_pole(n_I)
     along, in_front = lines.segment_place(n_I, l_I, o_C, line[7])
     beside = ca.fabs(ca.atan2(along, SEGMENT_AIM * in_front)) - np.pi / 4
     return lines.reprojection_error(n_I), _violation(in_front), _violation(-beside)

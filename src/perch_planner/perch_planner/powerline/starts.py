@@ -23,7 +23,7 @@ def random_start(nominal: PowerlineRequest, problem: PowerlineProblem, vehicle: 
 
     Args:
         nominal: the problem's own request.
-        problem: where the perch is given as point and pitch, its side follows the start.
+        problem: its gravity.
         vehicle: mass and rotors of the start's hover.
         rng: source of the draw.
     """
