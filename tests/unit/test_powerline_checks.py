@@ -133,6 +133,15 @@ def test_a_guess_upside_down_leans_back_though_the_wire_is_inclined() -> None:
     assert np.abs(b3[:, 1]).max() < 0.02
 
 
+@pytest.mark.parametrize("tilt_deg", [140, 151, 165, 179, 180])
+def test_the_guess_of_a_recovery_to_where_it_begins_ends_upright(tilt_deg: float) -> None:
+    """Ways out of a perch upside down: no direction of the way says through which side to turn."""
+    for side in ([1.0, 0, 0], [0, 1.0, 0], [-0.6, 0.8, 0]):
+        start = hover_state(MODEL, np.array([0.0, 0, 4]), so3.quat_exp(np.radians(tilt_deg) * np.array(side)))
+        states, _ = guess.recovery_guess(MODEL, start, start[:3], 0.85, 30)
+        np.testing.assert_allclose(so3.quat_to_matrix(states[-1, 3:7])[:, 2], [0.0, 0.0, 1.0], atol=1e-9)
+
+
 def test_guesses_turn_as_their_body_rates_say() -> None:
     start = hover_state(MODEL, np.array([0.0, 0, 4]), so3.quat_exp([0, 0, 0.3]))
     perch, _ = guess.perch_guess(MODEL, start, np.array([4.0, 0, 4.2]), np.array([-0.8, 0, 0.6]), 0.85, 60, b3_turn=0.5)

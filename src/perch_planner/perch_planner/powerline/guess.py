@@ -32,14 +32,15 @@ def turn_axis(b3_W: np.ndarray, s3_W: np.ndarray, via_W: np.ndarray) -> tuple[np
 
     Args:
         b3_W, s3_W: unit vectors in W, shape (3,).
-        via_W: direction through which b3 turns where the angle is near 180 degrees, shape (3,).
+        via_W: direction through which b3 turns where the angle is near 180 degrees, shape (3,); zero or along b3: the shortest way.
     """
     across, angle = np.cross(b3_W, s3_W), float(so3.angle_between(b3_W, s3_W))
     axis = across
     if angle > NEARLY_OPPOSITE:
         preferred_axis = np.cross(b3_W, via_W)
         plane = [v / np.linalg.norm(v) for v in (across, b3_W + s3_W) if np.linalg.norm(v) > 1e-9]
-        axis = sum((preferred_axis @ v) * v for v in plane) if plane else preferred_axis
+        through_via = sum((preferred_axis @ v) * v for v in plane) if plane else preferred_axis
+        axis = through_via if np.linalg.norm(through_via) > 1e-9 else across
     norm = np.linalg.norm(axis)
     if norm < 1e-9:
         return np.array([1.0, 0.0, 0.0]), angle
