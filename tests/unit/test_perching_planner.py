@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from perch_core import so3
+from perch_core import jit, so3
 from perch_core.errors import ConfigError
 from perch_core.isolated import IsolatedRunner
 from perch_core.surface import PerchSurface
@@ -260,6 +260,24 @@ def test_what_nobody_had_foreseen_is_a_refusal(ask: Asked, monkeypatch: pytest.M
     monkeypatch.setattr(perching_planner.planner, "plan", broken)
     plan = ask(request())
     assert plan.error_code == PerchPlanError.SOLVER and "IndexError: list index out of range" in plan.message
+
+
+@pytest.mark.skipif(not jit.COMPILED, reason="kernels are interpreted")
+@pytest.mark.parametrize("limits", [{}, {"height_max": 1.0}, {"height_min": 2.0, "height_max": 9.0}, {"clearance_min": 2.0}])
+def test_the_preload_loads_every_kernel_that_a_plan_calls(monkeypatch: pytest.MonkeyPatch, limits: dict) -> None:
+    """Compiling one takes longer than `time_limit`: on a new checkout, plans that call it would never come."""
+    called: set[Any] = set()
+    call = jit._Compiled.__call__
+    monkeypatch.setattr(jit._Compiled, "__call__", lambda kernel, *arguments: called.add(kernel) or call(kernel, *arguments))
+    component = PerchingPlanner(PerchingPlannerParameters(**limits))
+    component.warm_up()
+    component.preload()()
+    loaded = set(called)
+    ceiling = PerchSurface.from_inclination(np.array([0.0, 0.0, 4.0]), math.pi)
+    ask = planner(PerchingPlannerParameters())
+    plan = ask(request(ceiling, p=np.array([0.0, 0.0, 3.96]), waypoints=np.array([[0.0, 0.0, 3.5]])))
+    assert plan.iterations > 50 and ask(request(start=12_600_000_000, current=ask(request()).trajectory)).success
+    assert {kernel.py_func.__name__ for kernel in called - loaded} == set()
 
 
 def test_all_parameters_but_the_vehicle_may_change() -> None:

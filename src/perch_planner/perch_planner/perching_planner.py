@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import partial
 from typing import Any
@@ -16,7 +16,7 @@ from perch_core.component import Component, Diagnostics, Job, JobStopped, Servic
 from perch_core.config import quantity, text
 from perch_core.errors import ConfigError, PerchError
 from perch_core.surface import PerchSurface
-from perch_core.trajectory import FlatTrajectory
+from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.values import PerchPlan, PerchPlanRequest, limits, seconds
 from perch_core.values.planning import OPTIONS
 from perch_core.vehicle import Vehicle, load_vehicle
@@ -73,6 +73,10 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         super().__init__(config)
         self._vehicle = load_vehicle(config.vehicle)
 
+    def warm_up(self) -> None:
+        """Load or compile what samples `current` in a request."""
+        StartState.on(rest_to_rest(np.zeros(3), np.zeros(3), 0.0, 0.0, 1.0), 0.0)
+
     def preload(self) -> Callable[[], None]:
         """Return the function that loads or compiles the kernels."""
         return partial(_warm_up, self.config.settings, self._vehicle)
@@ -115,12 +119,13 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
 
 
 def _warm_up(settings: PerchSettings, vehicle: Vehicle) -> None:
-    """Plan once with each method, so that the kernels are compiled before the first request."""
+    """Plan once with each method, so that the kernels are compiled before the first request; limits of the place do not apply."""
+    settings = replace(settings, height_min=-1e4, height_max=1e4, clearance_min=0.0)
     surface = PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), math.radians(60.0))
     try:
         for method in (planner.plan, plan_way_out):
             method(PerchProblem(StartState(np.array([0.0, 0.0, 1.5])), surface), settings, vehicle)
-    except PerchRefusal:  # these limits may permit no plan; the kernels are compiled all the same
+    except PerchRefusal:  # the other limits may permit no plan; the kernels are compiled all the same
         pass
 
 
