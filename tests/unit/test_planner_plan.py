@@ -326,6 +326,14 @@ def test_a_plan_that_a_search_without_a_limit_finds_is_taken_where_it_keeps_the_
     assert checked(random_problem(np.random.default_rng(50117)), settings).duration < 3.0
 
 
+def test_the_clearance_that_a_refusal_names_is_near_what_a_plan_takes():
+    """Between the samples the rim comes nearer by more than a tenth."""
+    settings = PerchSettings(speed_max=2.8, duration_max=3.8433, tube_time=0.004, contact_delay=0.01, clearance_min=-0.0018, body_rate_max=2000.0)
+    with pytest.raises(PerchRefusal) as caught:
+        plan(random_problem(np.random.default_rng(50117)), settings, VEHICLE)
+    assert -0.1 < caught.value.relaxed["clearance_min"] < settings.clearance_min
+
+
 def test_values_that_remove_limits_are_valid_settings():
     ranges = {field.name: field.metadata for field in fields(PerchSettings)}
     for name, limit in relaxation._LIMITS.items():
