@@ -326,6 +326,15 @@ def test_a_plan_that_a_search_without_a_limit_finds_is_taken_where_it_keeps_the_
     assert checked(random_problem(np.random.default_rng(50117)), settings).duration < 3.0
 
 
+def test_a_limit_that_is_looser_than_what_removes_it_is_kept():
+    """A rotor that may stand still, and a body rate without bound."""
+    vehicle = replace(VEHICLE, speed_min=0.0)
+    problem, settings = PerchProblem(HOVER, surface(90.0)), PerchSettings(body_rate_max=2000.0)
+    tried = search.Search(problem, settings, vehicle, Limits.of(settings, vehicle))
+    used = relaxation._limit_usage(problem, tried.run().outcome, vehicle)
+    assert relaxation._Trials(tried, relaxation._requested(settings, tried.limits))._violated(relaxation._LIMITS, used) == []
+
+
 def test_the_clearance_that_a_refusal_names_is_near_what_a_plan_takes():
     """Between the samples the rim comes nearer by more than a tenth."""
     settings = PerchSettings(speed_max=2.8, duration_max=3.8433, tube_time=0.004, contact_delay=0.01, clearance_min=-0.0018, body_rate_max=2000.0)
@@ -340,6 +349,7 @@ def test_values_that_remove_limits_are_valid_settings():
         assert ranges[name]["low"] is None or ranges[name]["low"] <= limit.unlimited
         assert limit.unlimited <= ranges[name]["high"]
     assert relaxation._LIMITS["thrust_max"].unlimited == ranges["thrust_max"]["high"]
+    assert relaxation._LIMITS["body_rate_max"].unlimited == ranges["body_rate_max"]["high"]
 
 
 def test_a_rotor_margin_above_zero_is_reduced_to_zero_at_most_where_this_suffices():

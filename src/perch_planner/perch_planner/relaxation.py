@@ -54,7 +54,7 @@ _LIMITS = {
     "rotor_margin": _Limit(-1e3, refusals.THRUST_FLOOR, "thrust range of the single rotors"),
     "thrust_max": _Limit(4e3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
     "thrust_min": _Limit(1e-3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
-    "body_rate_max": _Limit(1e3, refusals.BODY_RATE, "body-rate limit", "rad/s"),
+    "body_rate_max": _Limit(1e4, refusals.BODY_RATE, "body-rate limit", "rad/s"),
     "clearance_min": _Limit(-1e3, refusals.BOX, "clearance from the surface until contact", "m"),
     "tangential_speed_max": _Limit(20.0, refusals.INFEASIBLE_WINDOW, "slip over the surface at contact [M:eq14]", "m/s"),
 }
@@ -101,9 +101,9 @@ def _refusal(search: Search, best: Outcome, requested: dict[str, float], relaxed
 
 
 def _requested(settings: PerchSettings, limits: Limits) -> dict[str, float]:
-    """Return the limits in force by the names of their settings."""
+    """Return the limits in force by the names of their settings; none is looser than the value that removes it."""
     return {name: getattr(settings, name) for name in _LIMITS} | {
-        "thrust_min": limits.thrust[0], "thrust_max": limits.thrust[1], "body_rate_max": limits.body_rate}
+        "thrust_min": max(limits.thrust[0], _LIMITS["thrust_min"].unlimited), "thrust_max": limits.thrust[1], "body_rate_max": limits.body_rate}
 
 
 def _format(name: str, value: float, least: float, most: float) -> str:
