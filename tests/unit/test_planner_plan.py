@@ -220,6 +220,14 @@ def test_refusals_name_the_constraint_and_its_margin(problem, settings, code):
     assert caught.value.constraint and str(caught.value)
 
 
+def test_rotors_of_a_plan_that_breaks_another_limit_are_not_called_proved():
+    """They are sampled only."""
+    with pytest.raises(PerchRefusal) as caught:
+        plan(PerchProblem(HOVER, surface(90.0)), PerchSettings(speed_max=0.9), VEHICLE)
+    rotors = next(c for c in caught.value.certificates if c.quantity == "rotor_thrust")
+    assert rotors.holds and rotors.method == "dense" and "proved" not in str(rotors)
+
+
 @pytest.mark.parametrize("x, words, margin", [
     (1.65, "0.050 m in front of the surface's plane; it needs more than 0.200 m", -0.15),
     (1.75, "0.050 m behind the surface's plane; it needs more than 0.200 m", -0.25)])
