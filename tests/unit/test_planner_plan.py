@@ -291,6 +291,16 @@ def test_a_contact_farther_away_than_speed_max_goes_in_duration_max_is_refused_b
     assert caught.value.margin == pytest.approx(12.0 * 20.0 - (0.1 + 59 * 8.0 + np.hypot(9.7, 0.1) - abs(VEHICLE.perch_offset)))
 
 
+@pytest.mark.parametrize("inclination, velocity, settings, least", [
+    (90.0, (50.0, 0.0, 0.0), {}, 50.65), (90.0, (-50.0, 0.0, 0.0), {}, 49.2), (90.0, (0.0, 13.0, 0.0), {}, np.hypot(12.7, 0.65)),
+    (180.0, (0.0, 0.0, 100.0), {}, 100.65), (90.0, (0.0, 0.0, 0.0), {"impact_speed_min": 15.0, "impact_speed_max": 20.0}, 15.0)])
+def test_a_contact_that_is_faster_than_speed_max_is_refused_before_the_search(inclination, velocity, settings, least):
+    problem = PerchProblem(HOVER, surface(inclination), target_velocity=velocity)
+    with pytest.raises(PerchRefusal, match="the contact takes a speed of at least") as caught:
+        plan(problem, PerchSettings(**settings), VEHICLE)
+    assert (caught.value.code, caught.value.iterations) == (refusals.BOX, 0) and caught.value.margin == pytest.approx(12.0 - least)
+
+
 @pytest.mark.parametrize("minimum_time", [False, True])
 def test_first_durations_beyond_duration_max_are_no_refusal(minimum_time):
     """The first guess is longer than 1.2 s, the shortest plan is not."""
