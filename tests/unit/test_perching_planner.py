@@ -25,7 +25,7 @@ from perch_core.vehicle import load_vehicle
 from perch_planner import perching_planner
 from perch_planner.perching_planner import PerchingPlanner, PerchingPlannerParameters, PerchPlanError
 from perch_planner.planner import plan
-from perch_planner.problem import PerchSettings
+from perch_planner.problem import PerchSettings, StartState
 from perch_planner.verifier import Requirements, verify
 from unit.planner_asker import Asked
 
@@ -260,6 +260,19 @@ def test_what_nobody_had_foreseen_is_a_refusal(ask: Asked, monkeypatch: pytest.M
     monkeypatch.setattr(perching_planner.planner, "plan", broken)
     plan = ask(request())
     assert plan.error_code == PerchPlanError.SOLVER and "IndexError: list index out of range" in plan.message
+
+
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"thrust_ratio": 0.2}, "request: thrust_ratio: 0.2: total thrust 0.90 N cannot lift 0.25 kg"),
+    ({"thrust_ratio": 2.0, "impact_acceleration": 0.0}, "impact_acceleration: 0 is outside")])
+def test_what_a_request_asks_for_is_refused_by_its_own_name(ask: Asked, changes: dict, words: str) -> None:
+    assert words in ask(request(**changes)).message
+
+
+def test_the_heading_at_either_end_of_its_range_is_planned(ask: Asked) -> None:
+    assert ask(request(yaw=1000.0)).success and ask(request(yaw=-1000.0)).success
+    with pytest.raises(ConfigError, match=r"start: yaw_acc: 1e\+06 is outside \[-1000, 1000\] rad/s\^2"):
+        StartState(np.zeros(3), yaw_acc=1e6)
 
 
 @pytest.mark.skipif(not jit.COMPILED, reason="kernels are interpreted")

@@ -97,8 +97,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         try:
             limits.check("request", request)
             problem = perch_problem(request)
-            vehicle = self._vehicle.with_thrust_ratio(request.thrust_ratio or 1.0)
-            arguments = (method, problem, perch_settings(request, self.config.settings), vehicle)
+            arguments = (method, problem, perch_settings(request, self.config.settings), perch_vehicle(request, self._vehicle))
         except PerchError as error:
             respond(error)
             return
@@ -184,6 +183,18 @@ def perch_settings(request: PerchPlanRequest, settings: PerchSettings) -> PerchS
         return config.replace(settings, **changes) if changes else settings
     except ConfigError as error:
         raise ConfigError("request", error.key, error.problem) from None
+
+
+def perch_vehicle(request: PerchPlanRequest, vehicle: Vehicle) -> Vehicle:
+    """Return the vehicle with the thrust ratio of a request.
+
+    Raises:
+        ConfigError: with this ratio it cannot fly.
+    """
+    try:
+        return vehicle.with_thrust_ratio(request.thrust_ratio or 1.0)
+    except ConfigError as error:
+        raise ConfigError("request", "thrust_ratio", f"{request.thrust_ratio:g}: {error.problem}") from None
 
 
 def perch_plan(found: planner.PerchPlan, request: PerchPlanRequest, contact_time: float) -> PerchPlan:

@@ -55,10 +55,10 @@ class StartState:
     def __post_init__(self) -> None:
         for key in ("p", "v", "a", "j"):
             object.__setattr__(self, key, _vector("start", key, getattr(self, key)))
-        for key in ("yaw", "yaw_rate", "yaw_acc"):
+        for key, unit in (("yaw", "rad"), ("yaw_rate", "rad/s"), ("yaw_acc", "rad/s^2")):
             value = float(getattr(self, key))
-            if not abs(value) < 1e3:
-                raise ConfigError("start", key, f"{value} is not a finite angle")
+            if not abs(value) <= 1e3:
+                raise ConfigError("start", key, f"{value:g} is outside [-1000, 1000] {unit}")
             object.__setattr__(self, key, value)
 
     @classmethod
