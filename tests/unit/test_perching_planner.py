@@ -20,7 +20,7 @@ from perch_core.errors import ConfigError
 from perch_core.isolated import IsolatedRunner
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
-from perch_core.values import PerchPlan, PerchPlanRequest
+from perch_core.values import PerchPlan, PerchPlanRequest, nanoseconds, seconds
 from perch_core.vehicle import load_vehicle
 from perch_planner import perching_planner
 from perch_planner.perching_planner import PerchingPlanner, PerchingPlannerParameters, PerchPlanError
@@ -150,6 +150,14 @@ def test_a_running_trajectory_is_replaced_from_a_future_point(ask: Asked) -> Non
         assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-6)
     late = ask(request(start=99_000_000_000, current=first))
     assert late.error_code == PerchPlanError.BAD_INPUT and "outside" in late.message
+
+
+def test_a_trajectory_is_replaced_from_its_very_start_also_by_the_clock_of_today(ask: Asked) -> None:
+    """A stamp in seconds has steps of 0.24 us then, and that of an answer is rounded twice."""
+    stamp = next(s for s in range(1_700_000_000_000_000_000, 1_700_000_001_000_000_000, 1_234_567) if seconds(s) < seconds(nanoseconds(seconds(s))))
+    first = ask(request(start=stamp)).trajectory
+    received = replace(first, start_time=seconds(nanoseconds(first.start_time)))
+    assert ask(request(start=stamp, current=received)).success
 
 
 def test_isolated_plans_are_those_of_this_process_to_the_last_bit(ask: Asked, isolated: Asked) -> None:

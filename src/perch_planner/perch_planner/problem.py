@@ -17,6 +17,7 @@ from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import GRAVITY, Vehicle
 
 _ZERO: Any = (0.0, 0.0, 0.0)  # made an array, as what is given
+_STAMP_ROUNDING = 1e-6         # of the difference of two stamps of today in seconds [s]
 
 
 def _vector(source: str, key: str, value: Any) -> np.ndarray:
@@ -68,7 +69,7 @@ class StartState:
         Raises:
             ConfigError: the time is outside the trajectory.
         """
-        if not 0.0 <= t <= trajectory.duration:
+        if not -_STAMP_ROUNDING <= t <= trajectory.duration + _STAMP_ROUNDING:
             span = f"[0, {trajectory.duration:g}] s"
             raise ConfigError("start", "time", f"{t:g} s is outside the current trajectory {span}")
         at = trajectory.sample(t)
