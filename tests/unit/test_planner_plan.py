@@ -339,6 +339,18 @@ def test_a_refusal_names_the_fewest_limits_and_values_that_do(settings, names, w
     checked(problem, PerchSettings(**settings | caught.value.relaxed))
 
 
+def test_a_refusal_does_not_try_plans_of_minutes(monkeypatch):
+    """Their programs have hundreds of segments, each takes a second: the time limit ended them, and no cause was named."""
+    tried, try_durations = [], search.Search.try_durations
+    monkeypatch.setattr(search.Search, "try_durations",
+                        lambda self, durations, *options, **more: tried.append(durations.sum()) or try_durations(self, durations, *options, **more))
+    problem = PerchProblem(StartState((-2.8, -1.0, 3.0)), surface(90.0, p=(1.7, 0.0, 1.5)), (Waypoint((-2.8, -1.0, 3.0)), Waypoint((1.6, 0.0, 3.0))),
+                           target_velocity=(0.0, 0.0, 7.0))
+    with pytest.raises(PerchRefusal) as caught:
+        plan(problem, PerchSettings(), VEHICLE)
+    assert max(tried) <= 60.0 and caught.value.relaxed
+
+
 def test_a_plan_that_a_search_without_a_limit_finds_is_taken_where_it_keeps_the_limit():
     settings = PerchSettings(speed_max=2.8, duration_max=3.8433, tube_time=0.004, contact_delay=0.01, clearance_min=-0.0018)
     assert checked(random_problem(np.random.default_rng(50117)), settings).duration < 3.0
