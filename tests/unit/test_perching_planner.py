@@ -15,17 +15,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from perch_core import so3
+from perch_core import jit, so3
 from perch_core.errors import ConfigError
 from perch_core.isolated import IsolatedRunner
 from perch_core.surface import PerchSurface
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
-from perch_core.values import PerchPlan, PerchPlanRequest
+from perch_core.values import PerchPlan, PerchPlanRequest, nanoseconds, seconds
 from perch_core.vehicle import load_vehicle
 from perch_planner import perching_planner
 from perch_planner.perching_planner import PerchingPlanner, PerchingPlannerParameters, PerchPlanError
 from perch_planner.planner import plan
-from perch_planner.problem import PerchSettings
+from perch_planner.problem import PerchSettings, StartState
 from perch_planner.verifier import Requirements, verify
 from unit.planner_asker import Asked
 
@@ -152,6 +152,14 @@ def test_a_running_trajectory_is_replaced_from_a_future_point(ask: Asked) -> Non
     assert late.error_code == PerchPlanError.BAD_INPUT and "outside" in late.message
 
 
+def test_a_trajectory_is_replaced_from_its_very_start_also_by_the_clock_of_today(ask: Asked) -> None:
+    """A stamp in seconds has steps of 0.24 us then, and that of an answer is rounded twice."""
+    stamp = next(s for s in range(1_700_000_000_000_000_000, 1_700_000_001_000_000_000, 1_234_567) if seconds(s) < seconds(nanoseconds(seconds(s))))
+    first = ask(request(start=stamp)).trajectory
+    received = replace(first, start_time=seconds(nanoseconds(first.start_time)))
+    assert ask(request(start=stamp, current=received)).success
+
+
 def test_isolated_plans_are_those_of_this_process_to_the_last_bit(ask: Asked, isolated: Asked) -> None:
     for asked in (request(), request(waypoints=np.array([[0.6, 0.1, 1.3]])), request(impact_acceleration=40.0)):
         here, there = ask(asked), isolated(asked)
@@ -260,6 +268,37 @@ def test_what_nobody_had_foreseen_is_a_refusal(ask: Asked, monkeypatch: pytest.M
     monkeypatch.setattr(perching_planner.planner, "plan", broken)
     plan = ask(request())
     assert plan.error_code == PerchPlanError.SOLVER and "IndexError: list index out of range" in plan.message
+
+
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"thrust_ratio": 0.2}, "request: thrust_ratio: 0.2: total thrust 0.90 N cannot lift 0.25 kg"),
+    ({"thrust_ratio": 2.0, "impact_acceleration": 0.0}, "impact_acceleration: 0 is outside")])
+def test_what_a_request_asks_for_is_refused_by_its_own_name(ask: Asked, changes: dict, words: str) -> None:
+    assert words in ask(request(**changes)).message
+
+
+def test_the_heading_at_either_end_of_its_range_is_planned(ask: Asked) -> None:
+    assert ask(request(yaw=1000.0)).success and ask(request(yaw=-1000.0)).success
+    with pytest.raises(ConfigError, match=r"start: yaw_acc: 1e\+06 is outside \[-1000, 1000\] rad/s\^2"):
+        StartState(np.zeros(3), yaw_acc=1e6)
+
+
+@pytest.mark.skipif(not jit.COMPILED, reason="kernels are interpreted")
+@pytest.mark.parametrize("limits", [{}, {"height_max": 1.0}, {"height_min": 2.0, "height_max": 9.0}, {"clearance_min": 2.0}])
+def test_the_preload_loads_every_kernel_that_a_plan_calls(monkeypatch: pytest.MonkeyPatch, limits: dict) -> None:
+    """Compiling one takes longer than `time_limit`: on a new checkout, plans that call it would never come."""
+    called: set[Any] = set()
+    call = jit._Compiled.__call__
+    monkeypatch.setattr(jit._Compiled, "__call__", lambda kernel, *arguments: called.add(kernel) or call(kernel, *arguments))
+    component = PerchingPlanner(PerchingPlannerParameters(**limits))
+    component.warm_up()
+    component.preload()()
+    loaded = set(called)
+    ceiling = PerchSurface.from_inclination(np.array([0.0, 0.0, 4.0]), math.pi)
+    ask = planner(PerchingPlannerParameters())
+    plan = ask(request(ceiling, p=np.array([0.0, 0.0, 3.96]), waypoints=np.array([[0.0, 0.0, 3.5]])))
+    assert plan.iterations > 50 and ask(request(start=12_600_000_000, current=ask(request()).trajectory)).success
+    assert {kernel.py_func.__name__ for kernel in called - loaded} == set()
 
 
 def test_all_parameters_but_the_vehicle_may_change() -> None:

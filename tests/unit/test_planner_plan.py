@@ -220,6 +220,14 @@ def test_refusals_name_the_constraint_and_its_margin(problem, settings, code):
     assert caught.value.constraint and str(caught.value)
 
 
+def test_rotors_of_a_plan_that_breaks_another_limit_are_not_called_proved():
+    """They are sampled only."""
+    with pytest.raises(PerchRefusal) as caught:
+        plan(PerchProblem(HOVER, surface(90.0)), PerchSettings(speed_max=0.9), VEHICLE)
+    rotors = next(c for c in caught.value.certificates if c.quantity == "rotor_thrust")
+    assert rotors.holds and rotors.method == "dense" and "proved" not in str(rotors)
+
+
 @pytest.mark.parametrize("x, words, margin", [
     (1.65, "0.050 m in front of the surface's plane; it needs more than 0.200 m", -0.15),
     (1.75, "0.050 m behind the surface's plane; it needs more than 0.200 m", -0.25)])
@@ -283,6 +291,16 @@ def test_a_contact_farther_away_than_speed_max_goes_in_duration_max_is_refused_b
     assert caught.value.margin == pytest.approx(12.0 * 20.0 - (0.1 + 59 * 8.0 + np.hypot(9.7, 0.1) - abs(VEHICLE.perch_offset)))
 
 
+@pytest.mark.parametrize("inclination, velocity, settings, least", [
+    (90.0, (50.0, 0.0, 0.0), {}, 50.65), (90.0, (-50.0, 0.0, 0.0), {}, 49.2), (90.0, (0.0, 13.0, 0.0), {}, np.hypot(12.7, 0.65)),
+    (180.0, (0.0, 0.0, 100.0), {}, 100.65), (90.0, (0.0, 0.0, 0.0), {"impact_speed_min": 15.0, "impact_speed_max": 20.0}, 15.0)])
+def test_a_contact_that_is_faster_than_speed_max_is_refused_before_the_search(inclination, velocity, settings, least):
+    problem = PerchProblem(HOVER, surface(inclination), target_velocity=velocity)
+    with pytest.raises(PerchRefusal, match="the contact takes a speed of at least") as caught:
+        plan(problem, PerchSettings(**settings), VEHICLE)
+    assert (caught.value.code, caught.value.iterations) == (refusals.BOX, 0) and caught.value.margin == pytest.approx(12.0 - least)
+
+
 @pytest.mark.parametrize("minimum_time", [False, True])
 def test_first_durations_beyond_duration_max_are_no_refusal(minimum_time):
     """The first guess is longer than 1.2 s, the shortest plan is not."""
@@ -321,9 +339,38 @@ def test_a_refusal_names_the_fewest_limits_and_values_that_do(settings, names, w
     checked(problem, PerchSettings(**settings | caught.value.relaxed))
 
 
+def test_a_refusal_does_not_try_plans_of_minutes(monkeypatch):
+    """Their programs have hundreds of segments, each takes a second: the time limit ended them, and no cause was named."""
+    tried, try_durations = [], search.Search.try_durations
+    monkeypatch.setattr(search.Search, "try_durations",
+                        lambda self, durations, *options, **more: tried.append(durations.sum()) or try_durations(self, durations, *options, **more))
+    problem = PerchProblem(StartState((-2.8, -1.0, 3.0)), surface(90.0, p=(1.7, 0.0, 1.5)), (Waypoint((-2.8, -1.0, 3.0)), Waypoint((1.6, 0.0, 3.0))),
+                           target_velocity=(0.0, 0.0, 7.0))
+    with pytest.raises(PerchRefusal) as caught:
+        plan(problem, PerchSettings(), VEHICLE)
+    assert max(tried) <= 60.0 and caught.value.relaxed
+
+
 def test_a_plan_that_a_search_without_a_limit_finds_is_taken_where_it_keeps_the_limit():
     settings = PerchSettings(speed_max=2.8, duration_max=3.8433, tube_time=0.004, contact_delay=0.01, clearance_min=-0.0018)
     assert checked(random_problem(np.random.default_rng(50117)), settings).duration < 3.0
+
+
+def test_a_limit_that_is_looser_than_what_removes_it_is_kept():
+    """A rotor that may stand still, and a body rate without bound."""
+    vehicle = replace(VEHICLE, speed_min=0.0)
+    problem, settings = PerchProblem(HOVER, surface(90.0)), PerchSettings(body_rate_max=2000.0)
+    tried = search.Search(problem, settings, vehicle, Limits.of(settings, vehicle))
+    used = relaxation._limit_usage(problem, tried.run().outcome, vehicle)
+    assert relaxation._Trials(tried, relaxation._requested(settings, tried.limits))._violated(relaxation._LIMITS, used) == []
+
+
+def test_the_clearance_that_a_refusal_names_is_near_what_a_plan_takes():
+    """Between the samples the rim comes nearer by more than a tenth."""
+    settings = PerchSettings(speed_max=2.8, duration_max=3.8433, tube_time=0.004, contact_delay=0.01, clearance_min=-0.0018, body_rate_max=2000.0)
+    with pytest.raises(PerchRefusal) as caught:
+        plan(random_problem(np.random.default_rng(50117)), settings, VEHICLE)
+    assert -0.1 < caught.value.relaxed["clearance_min"] < settings.clearance_min
 
 
 def test_values_that_remove_limits_are_valid_settings():
@@ -332,6 +379,7 @@ def test_values_that_remove_limits_are_valid_settings():
         assert ranges[name]["low"] is None or ranges[name]["low"] <= limit.unlimited
         assert limit.unlimited <= ranges[name]["high"]
     assert relaxation._LIMITS["thrust_max"].unlimited == ranges["thrust_max"]["high"]
+    assert relaxation._LIMITS["body_rate_max"].unlimited == ranges["body_rate_max"]["high"]
 
 
 def test_a_rotor_margin_above_zero_is_reduced_to_zero_at_most_where_this_suffices():

@@ -28,10 +28,10 @@ def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Cert
     table = (("N", *limits.thrust, mass, "bernstein"), ("m/s", -inf, limits.speed, 1.0, "bernstein"),
              ("m", *limits.height, 1.0, "bernstein"), ("m", limits.clearance, inf, 1.0, "bernstein"),
              ("rad/s", -inf, limits.body_rate, 1.0, "bernstein"), ("N", *limits.rotor_thrust, 1.0, "interval"))
-    out = []
+    out, others_hold = [], bool(results[:plan_checks.ROTOR_THRUST, plan_checks.HOLDS].all())  # else the rotors are not proved
     for quantity, row, (unit, low, high, scale, method) in zip(plan_checks.NAMES, results.tolist(), table):
         minimum, at_minimum, maximum, at_maximum, holds = row
-        if not holds and quantity in _SAMPLED:
+        if not holds and quantity in _SAMPLED or quantity == "rotor_thrust" and not others_hold:
             method = "dense"
         out.append(Certificate(quantity=quantity, unit=unit, lower_limit=low, upper_limit=high, minimum=scale * minimum,
                                maximum=scale * maximum, time_of_minimum=at_minimum, time_of_maximum=at_maximum, method=method,

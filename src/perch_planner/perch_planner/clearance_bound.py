@@ -47,7 +47,7 @@ def _rim_clears(distance: Array, force: Array, force2: Array, s3: Array, extensi
 @compiled
 def prove_clearance(distances: Array, forces: Array, squares: Array, s3: Array, extension: float, limit: float, sampled: float
                     ) -> tuple[float, int, float]:
-    """Prove a clearance near the sampled one, else that the limit holds, else find where the proof fails.
+    """Prove a clearance near the sampled one, else a lower one down to the limit, else find where the proof fails.
 
     Args:
         distances: from `surface_distance`, shape (f, 15) [m].
@@ -60,10 +60,10 @@ def prove_clearance(distances: Array, forces: Array, squares: Array, s3: Array, 
     Returns:
         (proved, segment, place): the proved clearance, or -inf and where the proof fails; segment -1 where it succeeds.
     """
-    failed, place = -1, 0.0
-    for gap in (sampled - 0.02 * abs(sampled) - 1e-3, sampled - 0.1 * abs(sampled) - 5e-3, limit):
-        if gap < limit:
-            continue
+    failed, place, gap, factor = -1, 0.0, np.inf, 1.0
+    while gap > limit:
+        gap = max(sampled - factor * 0.02 * abs(sampled) - factor * 1e-3, limit)
+        factor *= 5.0
         failed = -1
         for i in range(len(distances)):
             if smallest(distances[i]) > gap + extension:

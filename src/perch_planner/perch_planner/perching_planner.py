@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from perch_core.config import quantity, text
 from perch_core.errors import ConfigError, PerchError
 from perch_core.job import Job, JobStopped
 from perch_core.surface import PerchSurface
-from perch_core.trajectory import FlatTrajectory
+from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.values import PerchPlan, PerchPlanRequest, limits, seconds
 from perch_core.values.planning import OPTIONS
 from perch_core.vehicle import Vehicle, load_vehicle
@@ -74,6 +74,10 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         super().__init__(config)
         self._vehicle = load_vehicle(config.vehicle)
 
+    def warm_up(self) -> None:
+        """Load or compile what samples `current` in a request."""
+        StartState.on(rest_to_rest(np.zeros(3), np.zeros(3), 0.0, 0.0, 1.0), 0.0)
+
     def preload(self) -> Callable[[], None]:
         """Return the function that loads or compiles the kernels."""
         return partial(_warm_up, self.config.settings, self._vehicle)
@@ -94,8 +98,7 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
         try:
             limits.check("request", request)
             problem = perch_problem(request)
-            vehicle = self._vehicle.with_thrust_ratio(request.thrust_ratio or 1.0)
-            arguments = (method, problem, perch_settings(request, self.config.settings), vehicle)
+            arguments = (method, problem, perch_settings(request, self.config.settings), perch_vehicle(request, self._vehicle))
         except PerchError as error:
             respond(error)
             return
@@ -116,12 +119,13 @@ class PerchingPlanner(Component[PerchingPlannerParameters]):
 
 
 def _warm_up(settings: PerchSettings, vehicle: Vehicle) -> None:
-    """Plan once with each method, so that the kernels are compiled before the first request."""
+    """Plan once with each method, so that the kernels are compiled before the first request; limits of the place do not apply."""
+    settings = replace(settings, height_min=-1e4, height_max=1e4, clearance_min=0.0)
     surface = PerchSurface.from_inclination(np.array([2.0, 0.0, 1.5]), math.radians(60.0))
     try:
         for method in (planner.plan, plan_way_out):
             method(PerchProblem(StartState(np.array([0.0, 0.0, 1.5])), surface), settings, vehicle)
-    except PerchRefusal:  # these limits may permit no plan; the kernels are compiled all the same
+    except PerchRefusal:  # the other limits may permit no plan; the kernels are compiled all the same
         pass
 
 
@@ -180,6 +184,18 @@ def perch_settings(request: PerchPlanRequest, settings: PerchSettings) -> PerchS
         return config.replace(settings, **changes) if changes else settings
     except ConfigError as error:
         raise ConfigError("request", error.key, error.problem) from None
+
+
+def perch_vehicle(request: PerchPlanRequest, vehicle: Vehicle) -> Vehicle:
+    """Return the vehicle with the thrust ratio of a request.
+
+    Raises:
+        ConfigError: with this ratio it cannot fly.
+    """
+    try:
+        return vehicle.with_thrust_ratio(request.thrust_ratio or 1.0)
+    except ConfigError as error:
+        raise ConfigError("request", "thrust_ratio", f"{request.thrust_ratio:g}: {error.problem}") from None
 
 
 def perch_plan(found: planner.PerchPlan, request: PerchPlanRequest, contact_time: float) -> PerchPlan:

@@ -17,6 +17,7 @@ from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import GRAVITY, Vehicle
 
 _ZERO: Any = (0.0, 0.0, 0.0)  # made an array, as what is given
+_STAMP_ROUNDING = 1e-6         # of the difference of two stamps of today in seconds [s]
 
 
 def _vector(source: str, key: str, value: Any) -> np.ndarray:
@@ -55,10 +56,10 @@ class StartState:
     def __post_init__(self) -> None:
         for key in ("p", "v", "a", "j"):
             object.__setattr__(self, key, _vector("start", key, getattr(self, key)))
-        for key in ("yaw", "yaw_rate", "yaw_acc"):
+        for key, unit in (("yaw", "rad"), ("yaw_rate", "rad/s"), ("yaw_acc", "rad/s^2")):
             value = float(getattr(self, key))
-            if not abs(value) < 1e3:
-                raise ConfigError("start", key, f"{value} is not a finite angle")
+            if not abs(value) <= 1e3:
+                raise ConfigError("start", key, f"{value:g} is outside [-1000, 1000] {unit}")
             object.__setattr__(self, key, value)
 
     @classmethod
@@ -68,7 +69,7 @@ class StartState:
         Raises:
             ConfigError: the time is outside the trajectory.
         """
-        if not 0.0 <= t <= trajectory.duration:
+        if not -_STAMP_ROUNDING <= t <= trajectory.duration + _STAMP_ROUNDING:
             span = f"[0, {trajectory.duration:g}] s"
             raise ConfigError("start", "time", f"{t:g} s is outside the current trajectory {span}")
         at = trajectory.sample(t)

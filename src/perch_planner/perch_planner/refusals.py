@@ -90,7 +90,7 @@ def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Li
     Raises:
         PerchRefusal: the thrust limits are empty, the surface's attitude needs a thrust out of range [M:eq9, M:eq11], the
             vehicle cannot hover, start, waypoint or contact violate the box, the start violates thrust range or body rate,
-            or the contact is too far away.
+            or the contact is too fast or too far away.
     """
     low, high = limits.thrust
     contact = vehicle.mass * settings.impact_acceleration
@@ -133,6 +133,9 @@ def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Li
     if speed > limits.speed:
         raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
                            f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s")
+    if (slowest := _least_contact_speed(problem, settings)) > limits.speed:
+        raise PerchRefusal(BOX, "speed at the contact", limits.speed - slowest,
+                           f"the contact takes a speed of at least {slowest:.2f} m/s in W, more than speed_max {limits.speed:g} m/s")
     if path_length > limits.speed * settings.duration_max and at_rest:
         raise PerchRefusal(BOX, "speed_max and duration_max", limits.speed * settings.duration_max - path_length,
                            f"the path to the contact is {path_length:.1f} m, longer than speed_max {limits.speed:g} m/s covers in duration_max "
@@ -143,6 +146,14 @@ def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Li
     if too_near >= 0 and at_rest:
         raise PerchRefusal(BOX, f"clearance of waypoint {too_near - 1} from the surface's plane", waypoint_distance - least,
                            f"waypoint {too_near - 1} is {_describe_distance(waypoint_distance)}; it needs more than {least:.3f} m in front of it")
+
+
+def _least_contact_speed(problem: PerchProblem, settings: PerchSettings) -> float:
+    """Least speed in W of a contact within the impact window [m/s]. [uses M:eq14]"""
+    v, s3 = problem.target_velocity, problem.surface.normal
+    pace = -float(v @ s3)  # of the surface along -s3
+    slip = max(hypot(*(v + pace * s3).tolist()) - settings.tangential_speed_max, 0.0)
+    return hypot(max(pace + settings.impact_speed_min, -pace - settings.impact_speed_max, 0.0), slip)
 
 
 def _describe_distance(distance: float) -> str:

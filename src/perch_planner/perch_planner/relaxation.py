@@ -29,6 +29,8 @@ PROGRAMS_MAX = 600
 _PROGRAMS_PER_TRIAL = 100 # of one of them
 _VALUE_TRIALS = 5         # of values: what the plan took of a limit, then halves of the logarithm
 _SHARE_MIN = 1 / 64       # of what a plan takes beyond a limit that was removed; less is not tried
+_LONGEST_PLAN = 60.0      # [s] of a trial; plans of minutes have hundreds of segments, and each of their programs takes a second
+_LONGER_FACTORS = 3.0, 1.5  # of `duration_max` and of the first durations, where a trial may be longer
 
 
 class _Limit(NamedTuple):
@@ -54,7 +56,7 @@ _LIMITS = {
     "rotor_margin": _Limit(-1e3, refusals.THRUST_FLOOR, "thrust range of the single rotors"),
     "thrust_max": _Limit(4e3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
     "thrust_min": _Limit(1e-3, refusals.THRUST_FLOOR, "thrust range [M:eq16]", "N"),
-    "body_rate_max": _Limit(1e3, refusals.BODY_RATE, "body-rate limit", "rad/s"),
+    "body_rate_max": _Limit(1e4, refusals.BODY_RATE, "body-rate limit", "rad/s"),
     "clearance_min": _Limit(-1e3, refusals.BOX, "clearance from the surface until contact", "m"),
     "tangential_speed_max": _Limit(20.0, refusals.INFEASIBLE_WINDOW, "slip over the surface at contact [M:eq14]", "m/s"),
 }
@@ -101,9 +103,9 @@ def _refusal(search: Search, best: Outcome, requested: dict[str, float], relaxed
 
 
 def _requested(settings: PerchSettings, limits: Limits) -> dict[str, float]:
-    """Return the limits in force by the names of their settings."""
+    """Return the limits in force by the names of their settings; none is looser than the value that removes it."""
     return {name: getattr(settings, name) for name in _LIMITS} | {
-        "thrust_min": limits.thrust[0], "thrust_max": limits.thrust[1], "body_rate_max": limits.body_rate}
+        "thrust_min": max(limits.thrust[0], _LIMITS["thrust_min"].unlimited), "thrust_max": limits.thrust[1], "body_rate_max": limits.body_rate}
 
 
 def _format(name: str, value: float, least: float, most: float) -> str:
@@ -118,11 +120,6 @@ def _format(name: str, value: float, least: float, most: float) -> str:
     return f"{name} {value:g}{' ' + unit if unit else ''}{note}"
 
 
-def _removed_limits(names: Iterable[str]) -> dict[str, float]:
-    """Return the values that remove limits."""
-    return {name: _LIMITS[name].unlimited for name in names}
-
-
 class _Trials:
     """Searches with relaxed limits, bounded by their total number of programs."""
 
@@ -130,6 +127,9 @@ class _Trials:
         self._search, self.requested, self._programs_left = search, requested, PROGRAMS_MAX
         self.kept: Found | None = None
         """A plan of a trial that keeps all requested limits; it ends the trials."""
+        longest = max(_LONGEST_PLAN, _LONGER_FACTORS[0] * requested["duration_max"], _LONGER_FACTORS[1] * float(search.initial_durations.sum()))
+        self._unlimited = {name: limit.unlimited for name, limit in _LIMITS.items()}
+        self._unlimited["duration_max"] = min(longest, self._unlimited["duration_max"])
         self._tried: dict[frozenset[str], dict[str, float] | None] = {}
 
     def _usage_under(self, changes: dict[str, Any]) -> dict[str, float] | None:
@@ -153,7 +153,7 @@ class _Trials:
         """Return what a plan without some limits uses of each limit; None where a short search finds no plan."""
         removed = frozenset(names)
         if removed not in self._tried:
-            self._tried[removed] = self._usage_under(_removed_limits(names))
+            self._tried[removed] = self._usage_under({name: value for name, value in self._unlimited.items() if name in removed})
         return self._tried[removed]
 
     def _smallest_removal(self) -> tuple[list[str], dict[str, float]] | None:
@@ -178,7 +178,7 @@ class _Trials:
 
     def _violated(self, names: Iterable[str], used: dict[str, float]) -> list[str]:
         """Return the limits whose requested values a plan violates."""
-        return [n for n in names if (used[n] - self.requested[n]) * (_LIMITS[n].unlimited - self.requested[n]) > 0.0]
+        return [n for n in names if (used[n] - self.requested[n]) * (self._unlimited[n] - self.requested[n]) > 0.0]
 
     def relaxation(self) -> dict[str, float] | None:
         """Return values of limits that admit a plan, as near to the requested ones as bisection finds; None: none exist."""
@@ -201,7 +201,7 @@ class _Trials:
         """Return limits relaxed by a share of the excess of a plan over them; 1 covers all of it."""
         values = {}
         for name in names:
-            requested, unlimited = self.requested[name], _LIMITS[name].unlimited
+            requested, unlimited = self.requested[name], self._unlimited[name]
             values[name] = sorted((requested, _round_away(requested, requested + share * (used[name] - requested)), unlimited))[1]
         return values
 

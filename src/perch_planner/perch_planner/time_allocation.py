@@ -138,7 +138,6 @@ def split_last(durations: Array) -> Array:
     return out
 
 
-@compiled
 def split_finely(durations: Array, pieces: Array) -> Array:
     """Divide the last segment so that it ends with given pieces [s], with knots without conditions.
 
