@@ -92,7 +92,7 @@ def test_all_derivatives_up_to_the_fourth_are_continuous():
             assert left == pytest.approx(bernstein.evaluate(bernstein.derivative(after, order), 0.0) / U**order, rel=1e-6, abs=1e-5)
 
 
-@pytest.mark.parametrize("low, high, kept", [(0.98, 1.02, True), (1.02, 1.02, False), (0.98, 0.98, False)])
+@pytest.mark.parametrize("low, high, kept", [(0.98, 1.02, True), (1.02, 1.02, False), (0.98, 0.98, False), (0.0, 1.02, True)])
 def test_algorithm_1_decides_both_thrust_limits(low, high, kept):
     trajectory = planner.plan(CASES[1], SETTINGS, VEHICLE).trajectory
     p = np.ascontiguousarray(trajectory.coefficients[:, :3])

@@ -207,7 +207,7 @@ def squared_thrust(coefficients: np.ndarray, duration: float, mass: float) -> np
 def keeps_thrust(coefficients: np.ndarray, duration: float, mass: float, low: float, high: float) -> bool:
     """Check tau_min^2 <= H <= tau_max^2 on a segment by Algorithm 1. [M:eq16, M:alg1]"""
     H = squared_thrust(coefficients, duration, mass)
-    return bool(sturm.global_bound_check(H / high**2, 1.0, 0.0, 1.0) and sturm.global_bound_check(-H / low**2, -1.0, 0.0, 1.0))
+    return bool(sturm.global_bound_check(H / high**2, 1.0, 0.0, 1.0) and sturm.global_bound_check(-H / high**2, -(low / high) ** 2, 0.0, 1.0))
 
 
 class Iteration(NamedTuple):
