@@ -60,7 +60,8 @@ def test_the_script_finds_a_vehicle_beside_the_problem(tmp_path):
     (tmp_path / "heavy.yaml").write_text("extends: snapdragon\nmass: 0.5\n")
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(mapping() | {"vehicle": "heavy.yaml"}))
     done = call_script("plan.py", str(tmp_path / "mine.yaml"), "--out", str(tmp_path / "never"))
-    assert done.returncode == 2 and f"{tmp_path / 'heavy.yaml'}: speed_max: total thrust 4.50 N cannot lift 0.5 kg" in done.stderr
+    files = f"{tmp_path / 'heavy.yaml'} extends {ROOT / 'config/vehicles/snapdragon.yaml'}"
+    assert done.returncode == 2 and f"{files}: speed_max: total thrust 4.50 N cannot lift 0.5 kg" in done.stderr
 
 
 @pytest.mark.parametrize("arguments, code, words", [
