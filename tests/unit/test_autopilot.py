@@ -262,6 +262,8 @@ def test_a_command_with_the_motors_off_stops_them_whatever_else_it_says(flown_on
     assert node._link.told == [(False, CENTRED)]
     loop = object.__new__(FirmwareLoop)
     loop.sticks, loop.watchdog = node._sticks, watchdog()
+    loop.command(0, True, (0.0, 0.0, 0.0), 9.81)
+    assert loop.watchdog.channels(0.0)[4] == ON
     loop.command(0, *NONSENSE[1:])
     assert loop.watchdog.channels(0.0)[4] == OFF
 
@@ -275,13 +277,20 @@ def test_who_disarms_the_autopilot_is_obeyed_until_the_commands_have_the_motors_
     assert polled(node, 2.0, 100, 9.81) == [] and "kill" not in node._link.told
     monkeypatch.setattr(StubAutopilot, "armed", False)
     said, = polled(node, 3.0, 33, 9.81)
-    assert said.startswith("the autopilot was disarmed by its pilot") and node._link.told.count("kill") == 1
+    assert said.startswith("the autopilot was disarmed by its pilot") and "kill" in node._link.told
     polled(node, 3.33, 300, 9.81)
+    node._link.ended = True
+    polled(node, 6.5, 1)
+    assert node._link.told == ["kill"]                   # of the process that holds the link now
+    monkeypatch.setattr(StubAutopilot, "armed", True)    # the pilot flies
+    assert "the pilot must not hand over: its motors would stop until the controller has disarmed once" in polled(node, 6.6, 50, 9.81)
+    monkeypatch.setattr(StubAutopilot, "armed", False)
     node.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
-    polled(node, 7.0, 100, 9.81)
+    node._link.told.clear()
+    polled(node, 7.2, 100, 9.81)
     monkeypatch.setattr(StubAutopilot, "armed", True)
-    polled(node, 8.0, 100, 9.81)
-    assert node._link.told.count("kill") == 1
+    polled(node, 8.3, 100, 9.81)
+    assert "kill" not in node._link.told
 
 
 def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):

@@ -364,6 +364,14 @@ def test_kill_is_not_repeated_for_long_nor_by_a_clock_that_jumps():
         assert asked(machine, 20.0, start=10.0 + jump) == [Request.DISARM] * count
 
 
+def test_after_kill_commands_with_the_motors_off_disarm_however_late_the_link_is_back():
+    machine = Offboard(autopilot=PX4, armed=True, following=True)
+    assert asked(machine, 1.0) == []                           # it flies
+    machine.kill(1.0)
+    asked(machine, 9.0, start=1.0, wanted=False)               # lost, all of it
+    assert Request.DISARM in asked(machine, 2.1, start=10.0, wanted=False)
+
+
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
 def test_a_hosts_clock_that_jumps_is_one_line_and_everything_goes_on(autopilot):

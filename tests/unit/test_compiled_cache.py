@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import multiprocessing
 from pathlib import Path
 
@@ -56,6 +57,15 @@ def test_a_cache_that_cannot_be_written_says_so(cache: Path) -> None:
     cache.write_text("not a folder")
     with pytest.raises(PerchError, match="cannot be written: .*cache.*; set PERCH_CACHE"):
         compiled.library("test", SOURCE % 1)
+
+
+def test_a_cache_that_is_full_says_so(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(PerchError, match="cannot be written: .*No space left"):
+        compiled.library("test", SOURCE % 3)
 
 
 def test_compilation_can_be_turned_off(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -265,6 +265,19 @@ def test_a_jump_is_a_correction_at_any_speed_but_not_across_a_pause(step, interv
         np.testing.assert_allclose(poses.at(time).corrected, counted * jump, atol=1e-12)
 
 
+@pytest.mark.parametrize("rate, steps", [(500, [0.016] * 25), (150, [0.13] * 3), (30, [0.4 * 0.4 * 0.6**n for n in range(9)])])
+def test_a_jump_that_several_samples_have_counts_in_full_and_a_drift_does_not(rate, steps):
+    poses, level, drift = PoseBuffer(), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.05, 0.0, 0.0])  # of the position alone [m/s]
+    believed = np.array([0.0, 0.0, 2.0])
+    for k, step in enumerate([0.0] * (2 * rate) + steps + [0.0] * rate):
+        believed = believed + drift / rate + (0.0, 0.0, -step)
+        poses.add(BodyState(k / rate, believed, level, np.zeros(3), np.zeros(3), np.eye(6) * 1e-6))
+        if k == 2 * rate:
+            before = poses.at((k - 1) / rate).corrected
+    np.testing.assert_array_equal(before, np.zeros(3))
+    np.testing.assert_allclose(poses.at(poses.newest).corrected, [0.0, 0.0, -sum(steps)], atol=0.03)
+
+
 def test_nothing_is_mapped_from_a_pose_that_is_hardly_known():
     poses, level = PoseBuffer(), np.array([0.0, 0.0, 0.0, 1.0])
     for time, sigma in ((1.0, 0.1), (1.02, 0.1), (1.04, 3.0), (1.06, 3.0)):

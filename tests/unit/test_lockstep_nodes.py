@@ -165,7 +165,7 @@ def test_while_a_participant_is_connected_no_other_takes_its_place(vehicle):
     assert second.poll(1.0) and not first.poll(0.0) and made._missing() == ["estimator"]
     with pytest.raises(EOFError):
         second.recv_bytes()
-    assert logged == ["lockstep: another 'controller' tried to connect: ignored"]
+    assert logged == ["lockstep: another 'controller' tried to connect: ignored; end the process that is connected first"]
     made.wiring.participants["estimator"] = None  # of this process
     assert connect("estimator").poll(1.0)
 
@@ -225,6 +225,20 @@ def test_a_participant_without_a_vehicle_says_so(executor, monkeypatch):
     monkeypatch.setattr(Asking, "warn", lambda self, text, interval: warned.append(text))
     created(executor, ParticipantNode, Asking)
     assert warned == ["lockstep: no vehicle yet in namespace / for 0 s"]
+
+
+def test_a_participant_that_is_not_served_says_so(executor):
+    listener, said = ParticipantListener(address(os.environ.get("ROS_DOMAIN_ID", "0"), "/")), []
+    refused = created(executor, ParticipantNode, Asking)
+    refused.component.log.receivers.append(lambda line: said.append(line.text))
+    try:
+        refused.wiring.run_on(executor)
+        [(_, _, connection)] = listener.accept()
+        connection.close()
+        until(executor, lambda: said)
+        assert said[0].startswith("lockstep: the vehicle in namespace / closed the connection before the first step")
+    finally:
+        listener.close()
 
 
 class Failing(Component[Nothing]):

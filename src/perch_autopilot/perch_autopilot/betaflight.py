@@ -72,6 +72,7 @@ class Betaflight(Component[BetaflightParameters]):
         self._arm_commanded = False             # the motors are commanded to turn
         self._was_armed = False                 # and it has been armed since
         self._disarmed_reports = 0              # in a row that it is not, though it was: one alone may be corrupt
+        self._stopped = False                   # by KILL, or by whom it was disarmed: only a command with the motors off lets it arm again
         self._lifted = self._status is not None and self._status.armed  # a command since arming has commanded lift; armed at the start, it may fly
         self._now: int | None = None            # of the last poll [ns]
         self._last_answer = self._last_diagnostics = self._last_open = self._reported_errors = 0
@@ -116,7 +117,7 @@ class Betaflight(Component[BetaflightParameters]):
         if command.armed and not sum(value * value for value in values) < 1e8:
             self.warn(f"rates_thrust_command: {values} is not finite, or too large: ignored", min_interval=1.0)
             return
-        self._arm_commanded, self._was_armed = command.armed, self._was_armed and command.armed
+        self._arm_commanded, self._was_armed, self._stopped = command.armed, self._was_armed and command.armed, self._stopped and command.armed
         sticks = self._sticks.channels(command.w_B, command.thrust) if command.armed else CENTRED
         self._lifted = command.armed and (self._lifted or lifts(sticks, self._throttles()[0]))
         self._link.command(command.armed, sticks)
@@ -124,7 +125,11 @@ class Betaflight(Component[BetaflightParameters]):
     def on_command(self, command: ControllerCommand) -> None:
         """Stop the motors on KILL, also where no controller is there to obey it."""
         if command.command == Command.KILL and not command.is_stale(self._now or 0):
-            self._link.kill()
+            self._stop()
+
+    def _stop(self) -> None:
+        self._stopped = True
+        self._link.kill()
 
     # -- from it -----------------------------------------------------------------------------------------------------
 
@@ -169,7 +174,9 @@ class Betaflight(Component[BetaflightParameters]):
             return
         self._link.close()
         self._link = link
-        if self._status is not None and self._status.armed:
+        if self._stopped:
+            link.kill()
+        elif self._status is not None and self._status.armed:
             if self._lifted or not self._arm_commanded:
                 link.report_motors_turning()
             if self._arm_commanded:
@@ -208,11 +215,15 @@ class Betaflight(Component[BetaflightParameters]):
         """
         obeyed = self._was_armed and self._mode == Mode.FOLLOWING.value  # else the watchdog has disarmed it
         self._disarmed_reports = self._disarmed_reports + 1 if obeyed and not status.armed else 0
+        if self._stopped:
+            self._link.kill()  # again: the first may have been lost
+            if status.armed and self._arm_commanded:
+                self.log(LogLine("error", "the pilot must not hand over: its motors would stop until the controller has disarmed once", 2.0))
         if not self._arm_commanded or status.armed:
             self._arming_since, self._was_armed = None, self._arm_commanded
         elif self._disarmed_reports == 2:
             self._was_armed = False
-            self._link.kill()
+            self._stop()
             self.log(LogLine("error", "the autopilot was disarmed by its pilot, its failsafe or a restart: it arms again after a disarm"))
         elif self._arming_since is None:
             self._arming_since = now

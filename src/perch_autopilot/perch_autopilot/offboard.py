@@ -77,7 +77,7 @@ class Offboard:
         self._last_streaming, self._disarm_until = now, -1e9
 
     def kill(self, now: float) -> None:
-        """Record KILL, which the autopilot is sent, at a time [s]. It is not repeated later: a pilot may have armed it then."""
+        """Record KILL, which the autopilot is sent, at a time [s]. It is not repeated for long: a pilot may have armed it then."""
         self.killed, self._disarm_until, self._last_request = True, now + KILL_TIME, now
 
     @property
@@ -114,13 +114,14 @@ class Offboard:
         continued = self.commanding and 0.0 <= now - self._last_streaming <= RESTART_GAP
         self.commanding = continued or streaming and (wanted or self.alive(now) and not self.armed)
         request = Request.NOTHING
+        stopped = streaming and not wanted and self.commanding and self.armed and self.following  # by commands with the motors off
         if self.killed:
             self.killed = self.armed or wanted or not (streaming and self.alive(now))
-            request = Request.DISARM if now <= self._disarm_until else request
+            request = Request.DISARM if stopped or now <= self._disarm_until else request
         elif not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
             return request
         elif not wanted:
-            request = Request.DISARM if streaming and self.commanding and self.armed and self.following else request
+            request = Request.DISARM if stopped else request
             self.was_armed = self.was_armed and not streaming
             self.forced = self.forced and self.armed
         elif self.armed:

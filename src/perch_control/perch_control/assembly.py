@@ -178,10 +178,11 @@ class Assembly:
 
     def choose_lines(self) -> None:
         """Pass the lines of the map that are near the vehicle now to the laws that use them."""
-        for law in self.laws.values():
-            self._update_lines(law)
+        self._update_lines(*self.laws.values())
 
-    def _update_lines(self, law: Law) -> None:
+    def _update_lines(self, *laws: Law) -> None:
         state = self.flight.flight_state.state_estimate
         if self._params.nmpc.lines.any and state:
-            law.lines(chosen_lines(self._segments, np.array(state[0:3]), self._params.nmpc.lines.watched))
+            chosen = chosen_lines(self._segments, np.array(state[0:3]), self._params.nmpc.lines.watched)
+            for law in laws:
+                law.lines(chosen)

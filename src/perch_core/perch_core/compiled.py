@@ -71,16 +71,15 @@ def library(name: str, source: str, flags: tuple[str, ...] = FLAGS) -> Path | No
         return product
     try:
         product.parent.mkdir(parents=True, exist_ok=True)
-        folder = tempfile.TemporaryDirectory(dir=product.parent)
+        with tempfile.TemporaryDirectory(dir=product.parent) as folder:
+            code, object_file = Path(folder, "code.c"), Path(folder, "code.so")
+            code.write_text(source)
+            answer = subprocess.run([found[0], *flags, str(code), "-o", str(object_file), "-lm"],
+                                    capture_output=True, text=True, check=False)
+            if answer.returncode:
+                raise RuntimeError(f"{found[0]} cannot compile {name}: {answer.stderr[:500]}")
+            os.replace(object_file, product)
     except OSError as error:
         raise PerchError(f"the cache of compiled code cannot be written: {error}; set PERCH_CACHE to a folder that can be, or "
                          "PERCH_COMPILE to 0") from error
-    with folder as path:
-        code, object_file = Path(path, "code.c"), Path(path, "code.so")
-        code.write_text(source)
-        answer = subprocess.run([found[0], *flags, str(code), "-o", str(object_file), "-lm"],
-                                capture_output=True, text=True, check=False)
-        if answer.returncode:
-            raise RuntimeError(f"{found[0]} cannot compile {name}: {answer.stderr[:500]}")
-        os.replace(object_file, product)
     return product

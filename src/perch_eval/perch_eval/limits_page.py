@@ -38,11 +38,11 @@ Values beyond these limits are refused by every node, in one form:
 * a **parameter** is refused by its own declaration: `python3 scripts/param.py describe /<node>` shows unit and range;
   files likewise.
 
-NaN is outside every range, an infinity unless the range names it. Of a command to the motors that is not `armed`,
-nothing else counts: it is never refused. What depends on the present is judged by the node
-that knows it: stamps (far from the newest ones of their stream), frames, what a vehicle can do, where and when a
-trajectory begins. A planner has no clock: its plan begins when the request says, and the controller refuses a
-trajectory that begins more than 60 s ahead, or more than 0.5 s ago.
+NaN is outside every range, an infinity unless the range names it. Of a command to the motors that is not `armed`, no
+other value has limits. What depends on the present is judged by the node that knows it: stamps (far from the newest
+ones of their stream), frames, what a vehicle can do, where and when a trajectory begins. A planner has no clock: its
+plan begins when the request says, and the controller refuses a trajectory that begins more than 60 s ahead, or more
+than 0.5 s ago.
 """
 
 

@@ -21,7 +21,8 @@ SLOW = 1.0  # speed up to which the odometry's position is smoother than the int
 _COVARIANCE = limits.Covariance(6)  # at 500 Hz its variances alone are looked at
 SPAN = 1.0  # how much history is kept [s]
 MAX_GAP = 0.05  # states further apart than this are not interpolated [s]
-JUMP, JUMP_WITHIN = 0.15, 0.3  # odometry that moves by so much more than its velocity explains, within so long, has jumped [m, s]
+JUMP, JUMP_WITHIN = 0.15, 0.1  # odometry that moves by so much more than its velocity explains, within so long, has jumped [m, s]
+PAUSE = 0.3  # after a jump, corrections count in full for so long; across a longer pause of the odometry, none count [s]
 
 
 class StampError(PerchError):
@@ -64,6 +65,8 @@ class PoseBuffer:
         self._states: deque[BodyState] = deque()
         self._times: deque[float] = deque()
         self._corrected: deque[np.ndarray] = deque()
+        self._uncounted: deque[tuple[float, np.ndarray]] = deque()  # time, unexplained displacement that is not in `corrected`
+        self._last_jump = -np.inf  # [s]
 
     def __len__(self) -> int:
         return len(self._states)
@@ -120,16 +123,29 @@ class PoseBuffer:
     def _correction(self, state: BodyState) -> np.ndarray:
         """Return `corrected` for a state that follows the newest.
 
-        A jump counts in full. Smaller corrections count above the speed `SLOW`, in full from twice that speed, and not across a
-        gap. In a hover vision holds the position, and the velocity's error of some cm/s would accumulate.
+        A jump counts in full, whether one sample has it or several. Smaller corrections count above the speed `SLOW`, in full from
+        twice that speed, and not across a gap. In a hover vision holds the position, and the velocity's error of some cm/s would
+        accumulate.
         """
-        if not self._states:
-            return np.zeros(3)
+        window = self._uncounted
+        if not self._states or state.time - self._times[-1] >= PAUSE:
+            window.clear()
+            window.append((state.time, np.zeros(3)))
+            return self._corrected[-1] if self._states else np.zeros(3)
         before, dt = self._states[-1], state.time - self._times[-1]
         unexplained = state.p_WB - before.p_WB - (0.5 * dt) * (before.v_WB + state.v_WB)
-        jumped = dt < JUMP_WITHIN and math.sqrt(unexplained @ unexplained) > JUMP
-        share = 1.0 if jumped else 0.0 if dt > MAX_GAP else min(max(math.sqrt(state.v_WB @ state.v_WB) / SLOW - 1.0, 0.0), 1.0)
-        return self._corrected[-1] + share * unexplained
+        while len(window) > 1 and window[1][0] <= state.time - JUMP_WITHIN:
+            window.popleft()
+        recent = window[-1][1] + unexplained - window[0][1]
+        if math.sqrt(recent @ recent) > JUMP:
+            counted, self._last_jump = recent, state.time
+        elif state.time - self._last_jump < PAUSE:
+            counted = unexplained
+        else:
+            share = 0.0 if dt > MAX_GAP else min(max(math.sqrt(state.v_WB @ state.v_WB) / SLOW - 1.0, 0.0), 1.0)
+            counted = share * unexplained
+        window.append((state.time, window[-1][1] + unexplained - counted))
+        return self._corrected[-1] + counted
 
 
 def _between(a: BodyState, b: BodyState, share: float) -> BodyState:

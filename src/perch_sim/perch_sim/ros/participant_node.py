@@ -71,6 +71,7 @@ class ParticipantNode(ComponentNode):
         self._open_requests: list[_OpenRequest] = []
         self._busy = False  # processing a batch
         self._vehicle: Any = None  # the connection to it, if any
+        self._served = False  # a batch has come over this connection
         self._without_vehicle_since = time.monotonic()
         self._connection_poll = ConnectionPoll()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -106,6 +107,7 @@ class ParticipantNode(ComponentNode):
         if self._vehicle is None:
             self._vehicle = connect_to_vehicle(self._where, self.get_name(), self.participant.inputs)
             if self._vehicle is not None:
+                self._served = False
                 self._connection_poll.add(self._vehicle)
                 self.wiring.from_thread(self._process_batches)
             elif (waited := time.monotonic() - self._without_vehicle_since) > WARN_AFTER:
@@ -121,7 +123,7 @@ class ParticipantNode(ComponentNode):
             except (OSError, EOFError, PerchError):
                 self._disconnect()
                 return
-            self._busy = True
+            self._busy = self._served = True
             self.participant.begin(stamp, batch)
             self._finish_batch()
             if self._busy or self._vehicle is None:
@@ -165,6 +167,10 @@ class ParticipantNode(ComponentNode):
         self._check_timer.cancel()
         self._connection_poll.remove(self._vehicle)
         self._vehicle, self._without_vehicle_since = None, time.monotonic()
+        if not self._served:
+            name, namespace = self.get_name(), self.get_namespace()
+            self.component.warn(f"lockstep: the vehicle in namespace {namespace} closed the connection before the first step: it ended, "
+                                f"or another {name} is connected, or {name} is not in its parameter participants", WARN_REPEAT)
 
     # -- requests ----------------------------------------------------------------------------------------------------
 

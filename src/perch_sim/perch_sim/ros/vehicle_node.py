@@ -94,7 +94,7 @@ class VehicleNode(ComponentNode):
                 continue
             former = self._remote.get(name)
             if name in self.wiring.participants or former is not None and name not in self._disconnected:
-                self.warn_once(f"lockstep: another {name!r} tried to connect: ignored")
+                self.warn_once(f"lockstep: another {name!r} tried to connect: ignored; end the process that is connected first")
                 connection.close()
                 continue
             if former is not None:
