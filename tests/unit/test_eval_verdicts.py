@@ -1,6 +1,8 @@
 """Claims of the evaluation fail where flights do: rows that look good for the wrong reason do not hold."""
 
 import dataclasses
+from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import pytest
 from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_eval.campaign.results import RunResult
-from perch_eval.evaluation import control, inspection, perching, ways_out
+from perch_eval.evaluation import control, inspection, perching, powerline, ways_out
 from perch_eval.evaluation.sections import Effort
 from perch_eval.inspection.measures import inspection_result, judge, reference_states, segments, watched
 from perch_sim.scenario import load_scenario
@@ -91,4 +93,20 @@ def test_a_line_behind_the_camera_is_not_in_its_middle():
     away = states.copy()
     away[:, 3:7] = [so3.quat_multiply(q, np.array([0.0, 0.0, 1.0, 0.0])) for q in states[:, 3:7]]
     ahead, behind = (judge(way, lines, watched(scenario, lines), vehicle) for way in (states, away))
-    assert ahead.reprojection < 0.8 * ahead.corner and behind.reprojection == pytest.approx(behind.corner)
+    assert ahead.reprojection < 0.8 * ahead.visibility.corner and behind.reprojection == pytest.approx(behind.visibility.corner)
+    for judged in (ahead, behind):  # plans have the same measure
+        assert judged.visibility.summary()["mean_reprojection_px"] == judged.reprojection and judged.visibility.reprojection.max() <= judged.visibility.corner
+
+
+def test_shares_of_the_time_in_which_a_line_is_in_view_stand_under_their_own_names(effort, monkeypatch):
+    measures = {"mean_reprojection_px": 178.0, "segment_share": 0.99, "seen_share": 0.72}
+    monkeypatch.setattr(powerline, "problem", mock.MagicMock())
+    monkeypatch.setattr(powerline, "visibility", lambda *_: SimpleNamespace(summary=lambda: measures))
+    for draw in ("draw_manoeuvre", "draw_visibility"):
+        monkeypatch.setattr(powerline, draw, lambda *_: None)
+    low = SimpleNamespace(quantity="height", minimum=0.84, holds=True)
+    powerline.problem.plan.return_value.plan.bounds = [low]
+    rows = {row.name: row.ours for row in powerline._pictures(effort)[0].rows}
+    assert rows["80 deg: mean reprojection error"] == "178 px"
+    assert rows["80 deg: a part of the line in the image"] == "72 % of the time"
+    assert rows["80 deg: nearest point on the segment (14i)"] == "99 % of the time"
