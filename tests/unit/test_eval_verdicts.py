@@ -63,6 +63,19 @@ def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch)
     assert set(verdicts(ways_out.sections(effort)[0]).values()) == {"fails"}
 
 
+@pytest.mark.parametrize("before, planned, verdict", [(0.1, False, "holds"), (0.1, True, "fails"), (0.35, True, "fails"), (0.35, False, "fails")])
+def test_a_cancelled_flight_is_attached_for_good_only_where_it_was_too_late(effort, monkeypatch, before, planned, verdict):
+    def rows(effort, name, jobs, work, good):
+        flown = [{"scenario": s, "seed": n, "before": before, "planned": planned, "end": "attached", "message": "", "rate": 1.0, "margin": 0.1,
+                  "distance": 1.0, "settled": 0.1} for s, n, _ in jobs] if name == "aborted" else []
+        assert all(good(r) == (verdict == "holds") for r in flown)
+        return flown
+
+    monkeypatch.setattr(ways_out, "cached_figures", rows)
+    found = verdicts(ways_out.sections(effort)[0])
+    assert {found[f"{name}: cancelled on the way"] for name in ways_out.CANCELLED_FLIGHTS} == {verdict}
+
+
 def test_refusals_that_differ_in_the_interval_found_are_one_line(effort, monkeypatch):
     refusals = [f"clearance in [{low}, inf] m, required [0, inf]" for low in ("-0.2", "-inf", "-0.01")] + ["no stop"]
 
