@@ -334,6 +334,12 @@ def test_the_interval_is_that_of_the_score_test(k, n):
         assert abs(k / n - p) == pytest.approx(1.959964 * np.sqrt(p * (1.0 - p) / n), abs=1e-6) if p != outermost else k == n * outermost
 
 
+@pytest.mark.parametrize("k, n, share, shown", [(0, 0, 0.95, None), (1, 1, 0.95, None), (72, 72, 0.95, None), (73, 73, 0.95, True), (35, 35, 0.9, True),
+                                                (19, 20, 0.95, None), (95, 100, 0.95, True), (94, 100, 0.95, False), (0, 5, 0.95, False)])
+def test_few_trials_do_not_show_a_share_but_may_refute_it(k, n, share, shown):
+    assert Rate(k, n).at_least(share) is shown
+
+
 def test_a_rate_counts_outcomes():
     assert Rate.from_outcomes(k % 4 == 0 for k in range(10)) == Rate(3, 10) and Rate.from_outcomes([]) == Rate(0, 0)
 

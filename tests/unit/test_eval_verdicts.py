@@ -123,3 +123,10 @@ def test_shares_of_the_time_in_which_a_line_is_in_view_stand_under_their_own_nam
     assert rows["80 deg: mean reprojection error"] == "178 px"
     assert rows["80 deg: a part of the line in the image"] == "72 % of the time"
     assert rows["80 deg: nearest point on the segment (14i)"] == "99 % of the time"
+
+
+@pytest.mark.parametrize("flights, verdict", [(1, "vacuous"), (73, "holds")])
+def test_few_perches_do_not_show_a_success_rate(effort, flights, verdict):
+    perched = [RunResult(k, k, "perched", "perched", "") for k in range(flights)]
+    section = perching._successes(effort, dict.fromkeys(perching.CONDITIONS, perched))
+    assert set(verdicts(section).values()) == {verdict}

@@ -21,6 +21,7 @@ from perch_eval.evaluation.document import table, write_page
 from perch_eval.evaluation.kept import cached_figures
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.parameters import NodeParameters
+from perch_eval.statistics import Rate
 from perch_planner.perching_planner import PerchingPlannerParameters
 from perch_planner.planner import plan
 from perch_planner.powerline import problem
@@ -71,7 +72,7 @@ def sections(effort: Effort) -> list[Section]:
         early = [x for x in instants if x.time_to_contact >= NO_CONTACT_BEFORE]
         planned = sum(not r["refused"] for r in plans)
         out.claim(f"{title}: a way out {NO_CONTACT_BEFORE:g} s before contact and earlier", f"{_share(early)}; {planned} of {len(plans)} planned", "",
-                  planned == len(plans) and sum(not x.refusal for x in early) >= REQUIRED_SHARE * len(early) if early or planned < len(plans) else None,
+                  planned == len(plans) and Rate.from_outcomes(not x.refusal for x in early).at_least(REQUIRED_SHARE),
                   f"at least {100 * REQUIRED_SHARE:g} %, all planned")
     flown = cached_figures(effort, "aborted", list(_cancellations()), _fly_cancelled, lambda r: r["end"] == "hovering" or _too_late(r))
     text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
