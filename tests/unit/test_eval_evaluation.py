@@ -17,7 +17,7 @@ from perch_eval.campaign.engines import Task
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
 from perch_eval.evaluation import command, control, inspection, kept, planning_times
-from perch_eval.evaluation.cable import cable_of_length
+from perch_eval.evaluation.cable import cable_of_length, cable_sections
 from perch_eval.evaluation.nonlinear import solve
 from perch_eval.evaluation.planning_times import SETTINGS, waypoint_problem
 from perch_eval.evaluation.sections import Effort, Section
@@ -177,6 +177,11 @@ def test_the_cable_has_its_length_and_sag(share):
     points = cable.sample(20001)
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).sum() == pytest.approx(185.0, abs=1e-3)
     assert -points[:, 2].min() == pytest.approx(share * points[-1, 0], rel=1e-6)
+
+
+def test_the_mean_segment_length_which_follows_from_the_count_is_no_claim(tmp_path):
+    [section] = cable_sections(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1, {}))
+    assert {row.name for row in section.rows if row.verdict == "holds"} == {"mean error of 15 segments"}
 
 
 @pytest.mark.parametrize("waypoints", [3, 10])

@@ -36,15 +36,15 @@ def _table(effort: Effort) -> Section:
     count = 50 if effort.full else 5
     out = Section("p_table_1", "[P] Table I: planning time of perch and recovery",
                   f"{count} random starts around the nominal one for each row (generator seeds 1 to {count}); median [range] of the "
-                  "solver's wall-clock time on this machine, compiled functions loaded. Each plan is re-integrated at 1 ms and "
-                  "checked between the nodes. The paper: 5 experiments on a Jetson TX2.")
+                  "solver's wall-clock time on this machine, compiled functions loaded. Each plan is re-integrated at 1 ms; one "
+                  "that violates a limit there is refused. The paper: 5 experiments on a Jetson TX2.")
     vehicle = load_vehicle("rpg")
     planner = PowerlinePlanner(vehicle)
     planner.warm_up()
     for case, (_, _, paper_perch, paper_recovery) in TABLE.items():
         setup = problem.load(f"powerline_{case}")
         nominal = setup.request(vehicle)
-        perch, recovery, violated, refused = [], [], 0, []
+        perch, recovery, refused = [], [], []
         for seed in range(1, count + 1):
             try:
                 plan = planner.plan(random_start(nominal, setup, vehicle, np.random.default_rng(seed)))
@@ -56,14 +56,12 @@ def _table(effort: Effort) -> Section:
                 continue
             perch.append(plan.perch.solve_time)
             recovery.append(plan.recovery.solve_time)
-            violated += sum(not bound.holds for bound in plan.bounds)
         out.data[case] = {"perch_s": perch, "recovery_s": recovery, "refused": refused}
         for name, values, paper in (("perch", perch, paper_perch), ("recovery", recovery, paper_recovery)):
             spread = Spread.from_values(1e3 * v for v in values)
             out.claim(f"{TITLES[case]}: {name}", spread.to_text(1.0, 0, "ms"), f"{paper} ms", spread.median <= paper,
                       "median at most the paper's")
-        out.claim(f"{TITLES[case]}: starts solved, limits kept between nodes", f"{len(perch)}/{count}, {violated} violations",
-                  "", len(perch) == count and violated == 0, "; ".join(refused) or "all, none")
+        out.claim(f"{TITLES[case]}: starts solved", f"{len(perch)}/{count}", "", len(perch) == count, "; ".join(("all", *refused)))
     return out
 
 
@@ -157,8 +155,7 @@ def _pictures(effort: Effort) -> list[Section]:
                 section.show(f"{TITLES[case]}: {name}", f"{100 * means[case][key]:.0f} % of the time")
         else:
             low = next(b for b in planned.plan.bounds if b.quantity == "height")
-            section.claim("lowest height of the perch", f"{low.minimum:.3f} m", ">= 0.8 m", low.holds, "kept between the nodes, at 1 ms")
-            section.claim("every limit", f"{len(planned.plan.bounds)} certificates", "", all(b.holds for b in planned.plan.bounds), "all hold")
+            section.show("lowest height of the perch", f"{low.minimum:.3f} m", ">= 0.8 m", "a plan that violates a limit at 1 ms is refused")
     seven.claim("perception awareness lowers the reprojection error",
                 f"{means['line_80']['mean_reprojection_px']:.0f} -> {means['line_80_pa']['mean_reprojection_px']:.0f} px", "lower",
                 means["line_80_pa"]["mean_reprojection_px"] < means["line_80"]["mean_reprojection_px"], "as in Fig. 7")
