@@ -132,3 +132,16 @@ def test_few_perches_do_not_show_a_success_rate(effort, flights, verdict):
     perched = [RunResult(k, k, "perched", "perched", "") for k in range(flights)]
     section = perching._successes(effort, dict.fromkeys(perching.CONDITIONS, perched))
     assert set(verdicts(section).values()) == {verdict}
+
+
+def test_the_papers_body_rate_is_compared_like_for_like_and_the_other_one_says_what_was_chosen(effort, monkeypatch):
+    flights = {name: [RunResult(1, 1, "perched", "perched", "", metrics={"max_body_rate_deg_s": rate, "max_acceleration_m_s2": 10.0})]
+               for name, rate in (("surface_90", 427.0), (perching.AGGRESSIVE, 606.0))}
+    monkeypatch.setattr(perching, "fly", lambda *_, **__: SimpleNamespace(outcome="perched", message="", contacts=[], flight=None))
+    for name in ("FlightView", "plots"):
+        monkeypatch.setattr(perching, name, mock.MagicMock())
+    rows = {row.name: row for row in perching._figures(effort, flights)[1].rows}
+    like = rows["largest body rate, `surface_90`"]
+    assert like.verdict == "worse" and like.paper == "close to 600 deg/s"
+    chosen = rows["largest body rate, `surface_90_aggressive`"]
+    assert chosen.verdict == "holds" and "7.5 m/s^2, was chosen to reach the rate" in chosen.note

@@ -124,9 +124,12 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
                   f"{math.degrees(contact[0].tilt_error):.1f} deg", "0.4-0.6 m/s planned")
     rates, fast = (Spread.from_values(r.metrics.get("max_body_rate_deg_s") for r in groups[name]) for name in ("surface_90", AGGRESSIVE))
     peaks = Spread.from_values(r.metrics.get("max_acceleration_m_s2") for r in groups["surface_90"])
-    six.show("largest body rate, `surface_90`", rates.to_text(1.0, 0, "deg/s"))
+    impact = extended_mapping("scenarios", AGGRESSIVE)["parameters"]["perching_planner"]["impact_acceleration"]
+    six.compare("largest body rate, `surface_90`", rates.to_text(1.0, 0, "deg/s"), f"close to {PEAK_RATE:g} deg/s", rates.median >= PEAK_RATE,
+                "like for like: 90 deg, 1.7 m, the paper's impact acceleration")
     six.claim(f"largest body rate, `{AGGRESSIVE}`", fast.to_text(1.0, 0, "deg/s"), f"close to {PEAK_RATE:g} deg/s",
-              0.9 * PEAK_RATE <= fast.median <= 1.1 * PEAK_RATE if groups[AGGRESSIVE] else None, "within 10 % of the paper's")
+              0.9 * PEAK_RATE <= fast.median <= 1.1 * PEAK_RATE if groups[AGGRESSIVE] else None,
+              f"within 10 % of the paper's; this scenario's impact acceleration, {impact:g} m/s^2, was chosen to reach the rate")
     held = Rate.from_outcomes(r.cause == SUCCESS for r in groups[AGGRESSIVE])
     six.claim(f"perches, `{AGGRESSIVE}`", str(held), "", held.at_least(0.95), "at least 95 %")
     six.claim("largest acceleration", peaks.to_text(1.0, 1, "m/s^2"), f"up to {PEAK_ACCELERATION:g} m/s^2", peaks.median >= 0.7 * PEAK_ACCELERATION,
