@@ -145,3 +145,12 @@ def test_the_papers_body_rate_is_compared_like_for_like_and_the_other_one_says_w
     assert like.verdict == "worse" and like.paper == "close to 600 deg/s"
     chosen = rows["largest body rate, `surface_90_aggressive`"]
     assert chosen.verdict == "holds" and "7.5 m/s^2, was chosen to reach the rate" in chosen.note
+
+
+def test_errors_of_all_axes_together_are_those_of_each_flight(effort):
+    """Each flight is off along another axis: the medians of the axes are zero, the flights' errors are not."""
+    flights = [RunResult(k, k, "perched", "perched", "", metrics={f"{kind}_rmse_m_{axis}": 0.1 * (k + 1) if axis == "xyz"[k] else 0.0
+                                                                 for kind in ("tracking", "estimation") for axis in "xyz"}) for k in range(3)]
+    rows = {row.name: row for row in perching._errors(effort, dict.fromkeys(perching.CONDITIONS, flights)).rows}
+    row = rows["90 deg, 1.7 m: tracking, all axes"]
+    assert row.ours == "20.0 [10.0, 30.0] cm (3 of 3 flights)" and row.verdict == "FAILS"
