@@ -220,7 +220,14 @@ def test_a_comparison_with_a_flight_that_was_not_begun_is_written(tmp_path, monk
 
     monkeypatch.setattr(control, "cached_figures", known)
     sections = control.comparison_sections(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1))
-    assert len(sections) == 1 and "not begun: refused" in (tmp_path / "comparison.md").read_text()
+    page = (tmp_path / "comparison.md").read_text()
+    assert len(sections) == 1 and "not begun: refused" in page and control.GIVEN_PAD in page
+
+
+def test_the_page_of_faults_says_what_the_planner_is_given(tmp_path, monkeypatch):
+    monkeypatch.setattr(control, "cached_figures", lambda *_: [])
+    [section] = control.fault_sections(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1))
+    assert control.GIVEN_PAD in section.about and control.GIVEN_PAD in (tmp_path / "faults_in_flight.md").read_text()
 
 
 @pytest.mark.parametrize("count, collisions, verdict", [(3, 0, "vacuous"), (3, 1, "FAILS"), (20, 0, "holds"), (20, 1, "FAILS")])
