@@ -106,8 +106,10 @@ def flown_sections(effort: Effort) -> list[Section]:
             words = "; ".join(f"seed {r.seed}: {r.cause}: {r.message}" for r in without_grip if not recovered(r))
             out.claim(f"{name}, grip switched off: recoveries to a hover", f"{sum(map(recovered, without_grip))} of {len(without_grip)}", "",
                       not words, words or "all")
-        others = int(sum(r.metrics.get("other_lines_touched") or 0.0 for r in runs + without_grip))
-        out.claim(f"{name}: contacts with other lines", f"{others}", "", others == 0, "none")
+        touched = [value for r in runs + without_grip if (value := r.metrics.get("other_lines_touched")) is not None]
+        count = len(runs + without_grip)
+        out.claim(f"{name}: contacts with other lines", f"{sum(touched):.0f} ({len(touched)} of {count} flights)", "",
+                  sum(touched) == 0 and len(touched) == count if count else None, "none, every flight is carried out")
         out.data[case] = [{"seed": r.seed, "grips": r.values["grips"], "cause": r.cause, "outcome": r.outcome, "message": r.message, **r.metrics}
                           for r in runs + without_grip]
     return [out]
