@@ -82,6 +82,15 @@ def test_the_report_names_scenario_vehicle_and_code(tmp_path, monkeypatch, vary,
     assert page.count("<th>vehicle</th>") == bool(vehicle)
 
 
+def test_medians_of_the_report_have_the_number_of_their_values():
+    from perch_eval.campaign import report
+
+    found = [RunResult(k, k, cause, "", "", metrics={"contact_offset_m": offset}) for k, (cause, offset) in enumerate(
+        [("perched", 0.01), ("perched", 0.03), ("tilt", 0.05), ("not_found", None)])]
+    page = report._spreads(found, {"contact_offset_m": report.METRICS["contact_offset_m"]})
+    assert "3.00 [1.00, 5.00] (3)" in page and "2.00 [1.00, 3.00] (2)" in page
+
+
 def test_a_grid_is_gone_through_and_the_rest_drawn(tmp_path):
     campaign = load_campaign(write(tmp_path, """
 name: g

@@ -250,3 +250,5 @@ def test_the_ratio_of_planning_times_is_compared_with_the_papers(tmp_path, monke
     monkeypatch.setattr(planning_times, "solve", lambda *_: SimpleNamespace(converged=True, solve_time=factor * 1e-3))
     section = planning_times._table(Effort(False, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1, {}), load_vehicle("snapdragon"))
     assert {row.verdict for row in section.rows if "/ QP" in row.name} == {verdict}
+    assert {row.name.partition(", ")[0] for row in section.rows if row.name.endswith("wall clock")} == {"shipped planner"}
+    assert sum(row.name.endswith("CPU time") for row in section.rows) == 4
