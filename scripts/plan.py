@@ -63,7 +63,7 @@ def _plan_powerline(mapping: dict, source: str, out: Path, animation: bool) -> i
         print(f"  {bound}")
     summary = written.get("visibility")
     if summary is not None:
-        print(f"line in front {100 * summary['cheirality_share']:.0f} %, its segment at the centre {100 * summary['segment_share']:.0f} %, "
+        print(f"line in front {100 * summary['cheirality_share']:.0f} %, nearest point on its segment {100 * summary['segment_share']:.0f} %, "
               f"in the image {100 * summary['seen_share']:.0f} % of the perch; mean |reprojection| {summary['mean_reprojection_px']:.0f} px")
     print("written: " + ", ".join(written["files"]))
     return 0

@@ -82,6 +82,15 @@ def test_the_report_names_scenario_vehicle_and_code(tmp_path, monkeypatch, vary,
     assert page.count("<th>vehicle</th>") == bool(vehicle)
 
 
+def test_medians_of_the_report_have_the_number_of_their_values():
+    from perch_eval.campaign import report
+
+    found = [RunResult(k, k, cause, "", "", metrics={"contact_offset_m": offset}) for k, (cause, offset) in enumerate(
+        [("perched", 0.01), ("perched", 0.03), ("tilt", 0.05), ("not_found", None)])]
+    page = report._spreads(found, {"contact_offset_m": report.METRICS["contact_offset_m"]})
+    assert "3.00 [1.00, 5.00] (3)" in page and "2.00 [1.00, 3.00] (2)" in page
+
+
 def test_a_grid_is_gone_through_and_the_rest_drawn(tmp_path):
     campaign = load_campaign(write(tmp_path, """
 name: g
@@ -332,6 +341,12 @@ def test_the_interval_is_that_of_the_score_test(k, n):
     """At its ends the share that was seen is 1.96 standard deviations from the rate (Wilson 1927)."""
     for p, outermost in zip(Rate(k, n).interval, (0.0, 1.0)):
         assert abs(k / n - p) == pytest.approx(1.959964 * np.sqrt(p * (1.0 - p) / n), abs=1e-6) if p != outermost else k == n * outermost
+
+
+@pytest.mark.parametrize("k, n, share, shown", [(0, 0, 0.95, None), (1, 1, 0.95, None), (72, 72, 0.95, None), (73, 73, 0.95, True), (35, 35, 0.9, True),
+                                                (19, 20, 0.95, None), (95, 100, 0.95, True), (94, 100, 0.95, False), (0, 5, 0.95, False)])
+def test_few_trials_do_not_show_a_share_but_may_refute_it(k, n, share, shown):
+    assert Rate(k, n).at_least(share) is shown
 
 
 def test_a_rate_counts_outcomes():

@@ -17,7 +17,7 @@ from perch_eval.campaign.engines import Task
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
 from perch_eval.evaluation import command, control, inspection, kept, planning_times
-from perch_eval.evaluation.cable import cable_of_length
+from perch_eval.evaluation.cable import cable_of_length, cable_sections
 from perch_eval.evaluation.nonlinear import solve
 from perch_eval.evaluation.planning_times import SETTINGS, waypoint_problem
 from perch_eval.evaluation.sections import Effort, Section
@@ -179,6 +179,11 @@ def test_the_cable_has_its_length_and_sag(share):
     assert -points[:, 2].min() == pytest.approx(share * points[-1, 0], rel=1e-6)
 
 
+def test_the_mean_segment_length_which_follows_from_the_count_is_no_claim(tmp_path):
+    [section] = cable_sections(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1, {}))
+    assert {row.name for row in section.rows if row.verdict == "holds"} == {"mean error of 15 segments"}
+
+
 @pytest.mark.parametrize("waypoints", [3, 10])
 @pytest.mark.slow
 def test_the_nonlinear_program_keeps_the_thrust_bound_and_costs_no_more_than_the_papers_plan(waypoints):
@@ -215,7 +220,14 @@ def test_a_comparison_with_a_flight_that_was_not_begun_is_written(tmp_path, monk
 
     monkeypatch.setattr(control, "cached_figures", known)
     sections = control.comparison_sections(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1))
-    assert len(sections) == 1 and "not begun: refused" in (tmp_path / "comparison.md").read_text()
+    page = (tmp_path / "comparison.md").read_text()
+    assert len(sections) == 1 and "not begun: refused" in page and control.GIVEN_PAD in page
+
+
+def test_the_page_of_faults_says_what_the_planner_is_given(tmp_path, monkeypatch):
+    monkeypatch.setattr(control, "cached_figures", lambda *_: [])
+    [section] = control.fault_sections(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1))
+    assert control.GIVEN_PAD in section.about and control.GIVEN_PAD in (tmp_path / "faults_in_flight.md").read_text()
 
 
 @pytest.mark.parametrize("count, collisions, verdict", [(3, 0, "vacuous"), (3, 1, "FAILS"), (20, 0, "holds"), (20, 1, "FAILS")])
@@ -238,3 +250,5 @@ def test_the_ratio_of_planning_times_is_compared_with_the_papers(tmp_path, monke
     monkeypatch.setattr(planning_times, "solve", lambda *_: SimpleNamespace(converged=True, solve_time=factor * 1e-3))
     section = planning_times._table(Effort(False, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), 1, {}), load_vehicle("snapdragon"))
     assert {row.verdict for row in section.rows if "/ QP" in row.name} == {verdict}
+    assert {row.name.partition(", ")[0] for row in section.rows if row.name.endswith("wall clock")} == {"shipped planner"}
+    assert sum(row.name.endswith("CPU time") for row in section.rows) == 4

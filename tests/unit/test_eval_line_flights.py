@@ -11,7 +11,7 @@ from perch_core.values import AtEnd, Contact, MappedPowerline, PowerlineMap, Tra
 from perch_eval.campaign.results import RunResult
 from perch_eval.evaluation import kept, powerline, powerline_flights
 from perch_eval.evaluation.powerline import POSITION, flown_sections
-from perch_eval.evaluation.powerline_flights import mapping_errors, perching_errors
+from perch_eval.evaluation.powerline_flights import hovers_at_end, mapping_errors, perching_errors
 from perch_eval.evaluation.sections import FAILS, HOLDS, SHOWN, VACUOUS, Effort
 from perch_eval.flight import Flight, States
 from perch_sim.scenario import Cable, Mission, Scenario, World
@@ -101,6 +101,16 @@ def effort(tmp_path, seeds: int) -> Effort:
                   code={"commit": "1234567", "digest": "0123456789ab"})
 
 
+def test_a_hover_at_the_end_is_slow_high_and_free_of_the_wire():
+    flight = Flown(13.0)
+    x = flight._truth
+    assert hovers_at_end(flight)
+    for p, v in ((x.p, x.v + 0.5), (x.p * (1.0, 1.0, 0.05), x.v)):
+        flight._truth = States(x.t, p, x.q, v, x.w)
+        assert not hovers_at_end(flight)
+    assert not hovers_at_end(Flown(13.0, touch=12.0))
+
+
 def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_when_seeds_are_added(tmp_path, monkeypatch):
     handed = []
 
@@ -119,13 +129,14 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
     assert len(handed) == len({task.run.number for task in handed}) == 13, "nothing is flown twice"
 
 
-@pytest.mark.parametrize("outcome, message, verdict", [("missed", "no adhesion; recovered to a hover", HOLDS),
-                                                       ("failed", "crashed: a cable in the rotors", FAILS)])
-def test_a_flight_without_a_grip_must_end_in_a_hover(tmp_path, monkeypatch, outcome, message, verdict):
+@pytest.mark.parametrize("outcome, message, hovers, verdict", [("missed", "no adhesion; recovered to a hover", 1.0, HOLDS),
+                                                               ("missed", "no adhesion; recovered to a hover", 0.0, FAILS),
+                                                               ("failed", "crashed: a cable in the rotors", 0.0, FAILS)])
+def test_a_flight_without_a_grip_must_end_in_a_hover(tmp_path, monkeypatch, outcome, message, hovers, verdict):
     def pool(work, tasks, jobs, dead):
         for task in tasks:
             end = ("perched", "perched", "") if task.run.values["grips"] else ("missed_pad", outcome, message)
-            errors = {"perching_position_m": 0.01, "perching_tilt_deg": 1.0}
+            errors = {"perching_position_m": 0.01, "perching_tilt_deg": 1.0, "hovers_at_end": hovers}
             yield task, asdict(RunResult(task.run.number, task.run.seed, *end, task.run.values, errors))
 
     monkeypatch.setattr(kept, "in_processes", pool)
@@ -160,3 +171,5 @@ def test_errors_of_flights_that_never_came_to_the_line_fail(tmp_path, monkeypatc
     rows = {row.name: row for row in section.rows}
     for name in (f"80 deg: {POSITION}", "80 deg: pitch-roll RMSE", "80 deg: mapping"):
         assert rows[name].verdict == FAILS and "(0 of 2 flights)" in rows[name].ours
+    contacts = rows["80 deg: contacts with other lines"]
+    assert contacts.verdict == FAILS and contacts.ours == "0 (0 of 4 flights)", "not carried out, they touched nothing"

@@ -40,6 +40,13 @@ class Rate:
         middle, half = (k + 0.5 * z**2) / (n + z**2), z / (n + z**2) * math.sqrt(k * (n - k) / n + 0.25 * z**2)
         return max(0.0, middle - half), min(1.0, middle + half)
 
+    def at_least(self, share: float) -> bool | None:
+        """Return whether the rate is at least a share; None: it is not below it, but of so few trials that even all successes would not
+        show it."""
+        if self.interval[1] < share:
+            return False
+        return self.value >= share if Rate(self.trials, self.trials).interval[0] >= share else None
+
     def __str__(self) -> str:
         low, high = self.interval
         return f"{self.successes}/{self.trials} = {100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"

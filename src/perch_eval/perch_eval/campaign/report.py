@@ -72,8 +72,11 @@ def _causes(found: Sequence[RunResult], folder: Path) -> str:
 
 def _spreads(found: Sequence[RunResult], present: dict[str, tuple[str, float]]) -> str:
     perched = [r for r in found if r.cause == SUCCESS]
-    return table(((title, *(Spread.from_values(r.metrics.get(name) for r in some).to_text(factor, 2) for some in (found, perched)))
-                  for name, (title, factor) in present.items()), ("median [range]", "all flights", "perched"))
+    rows = []
+    for name, (title, factor) in present.items():
+        spreads = [Spread.from_values(r.metrics.get(name) for r in some) for some in (found, perched)]
+        rows.append((title, *(f"{spread.to_text(factor, 2)} ({spread.count})" for spread in spreads)))
+    return table(rows, ("median [range] (number)", "all flights", "perched"))
 
 
 def _flights(found: Sequence[RunResult], folder: Path) -> str:

@@ -17,6 +17,7 @@ from perch_eval.evaluation.document import table, write_page
 from perch_eval.evaluation.kept import cached_figures
 from perch_eval.evaluation.sections import Effort, Section
 
+GIVEN_PAD = "The pad is not localised: the planner is given its true pose, shifted by the position error of the estimate."
 MOMENTS = 20                         # of each fault
 QUICK_SEEDS, FULL_SEEDS = 1, 5       # of the comparison
 MAX_RMSE = 0.05                      # of each axis of a perch [m]
@@ -32,7 +33,8 @@ def fault_sections(effort: Effort) -> list[Section]:
     jobs = [(fault.name, seed) for fault in FAULTS for seed in range(1, MOMENTS + 1)]
     flown = cached_figures(effort, "faults", jobs, _fly_with_fault, lambda r: r["end"] in END_STATES)
     about = (f"Each fault strikes at {MOMENTS} random moments (seeds 1 to {MOMENTS}) between the order to take off and the planned contact of a "
-             "perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. The end is judged by the truth.")
+             f"perch on a wall (`surface_90`); plant, IMU, VIO model, UKF, supervisor and law in one loop. {GIVEN_PAD} The end is judged "
+             "by the truth.")
     out = Section("c_faults", "Faults in flight", f"{about} Flights without a good end: [faults_in_flight.md](faults_in_flight.md).")
     rows = []
     for fault in FAULTS:
@@ -64,7 +66,8 @@ def comparison_sections(effort: Effort) -> list[Section]:
     about = (f"{'Seed 1' if len(seeds) == 1 else f'Seeds 1 to {len(seeds)}'}; true position against the reference "
              "(line: as commanded; perch: the plan), RMS per axis x, y, z; "
              f"the state is estimated (VIO model, UKF). Line: ({offset}) m in {LINE_TIME:g} s and 0.5 s of hover. Perch: 90 deg, 1.7 m, to the contact. "
-             "Wind 5 m/s blows at 45 deg to the wall. With L1 the controller measures thrust / mass in hover and flies the perch with it.")
+             "Wind 5 m/s blows at 45 deg to the wall. With L1 the controller measures thrust / mass in hover and flies the perch with it. "
+             f"{GIVEN_PAD}")
     out = Section("c_comparison", "Controllers compared on the same flights", f"{about} All conditions: [comparison.md](comparison.md).")
     text = ["# Controllers compared", "", f"{about} Every flight: [comparison.json](comparison.json)."]
     for maneuver in MANEUVERS:

@@ -19,6 +19,7 @@ ROWS = (
     ("M, Table II: estimation error, 90 deg, 1.7 m", "m_table_2", "90 deg, 1.7 m: estimation, all axes"),
     ("M, Table III: perches, 90 deg, 1.7 m", "m_table_3", "90 deg, 1.7 m"),
     ("M, Table III: perches, 90 deg, 3 m", "m_table_3", "90 deg, 3 m"),
+    ("M, Fig. 6: largest body rate, 90 deg, 1.7 m", "m_fig_6", "largest body rate, `surface_90`"),
     ("M, Fig. 6: largest body rate, 90 deg, 1.7 m, setting `surface_90_aggressive`", "m_fig_6", "largest body rate, `surface_90_aggressive`"),
     ("P, Table I: position RMSE at the cable, true against planned place, 80 deg", "p_table_1_flown", f"80 deg: {POSITION}"),
     ("P, Table I: position RMSE at the cable, true against planned place, upside down", "p_table_1_flown", f"180 deg: {POSITION}"),

@@ -71,32 +71,30 @@ def _errors(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
                   "flights with a planned perch. Both cameras are rendered; VIO, UKF, tag localisation, planner and controller are those that fly.")
     for name, paper in RMSE.items():
         for kind, values in zip(("tracking", "estimation"), paper):
-            medians, judged = [], len(groups[name])
-            for axis, value in zip("xyz", values):
-                errors = [r.metrics.get(f"{kind}_rmse_m_{axis}") for r in groups[name]]
+            flights = [[r.metrics.get(f"{kind}_rmse_m_{axis}") for axis in "xyz"] for r in groups[name]]
+            for axis, value, *errors in zip("xyz", values, *flights):
                 spread = Spread.from_values(errors)
-                medians.append(spread.median)
-                judged = min(judged, spread.count)
                 out.compare(f"{_condition_text(name)}: {kind} {axis}", f"{spread.to_text(100, 1, 'cm')} ({spread.count} of {len(errors)} flights)",
                             f"{100 * value:.2f} cm", spread.median <= value)
                 out.data[f"{name}_{kind}_{axis}"] = errors
-            ours, theirs = math.hypot(*medians), math.hypot(*values)
-            out.claim(f"{_condition_text(name)}: {kind}, all axes", f"{100 * ours:.1f} cm ({judged} of {len(groups[name])} flights)",
-                      f"{100 * theirs:.1f} cm", ours <= theirs and judged == len(groups[name]),
-                      "root of the sum of squares is at most the paper's; every flight begins its perch")
+            together = Spread.from_values(float(np.linalg.norm(np.array(errors, float))) for errors in flights)
+            theirs = math.hypot(*values)
+            out.claim(f"{_condition_text(name)}: {kind}, all axes", f"{together.to_text(100, 1, 'cm')} ({together.count} of {len(flights)} flights)",
+                      f"{100 * theirs:.1f} cm", together.median <= theirs and together.count == len(flights),
+                      "median of the flights' roots of the sum of squares is at most the paper's; every flight begins its perch")
     return out
 
 
 def _successes(effort: Effort, groups: dict[str, list[RunResult]]) -> Section:
     out = Section("m_table_3", "[M] Table III: success rate",
                   f"{_seeds_text(effort).capitalize()}; a success: the vehicle is attached to the pad at the end, and the mission reports it. "
-                  "95 % Wilson intervals.")
+                  "95 % Wilson intervals; a required rate that as many flights would not show if all succeeded is vacuous (95 %: below 73 flights).")
     for name, paper in SUCCESSES.items():
         rate = Rate.from_outcomes(r.cause == SUCCESS for r in groups[name])
         bar = REQUIRED_RATES[name] if effort.full else paper / 5
         why = f"at least {100 * bar:.0f} %" + ("" if effort.full else ", the paper's rate")
         causes = ", ".join(f"seed {r.seed}: {r.cause}" for r in groups[name] if r.cause != SUCCESS)
-        out.claim(_condition_text(name), str(rate), f"{paper}/5", rate.value >= bar if rate.trials else None,
+        out.claim(_condition_text(name), str(rate), f"{paper}/5", rate.at_least(bar),
                   why + (f"; failed: {causes}" if causes else ""))
         out.data[name] = {"successes": rate.successes, "trials": rate.trials, "interval": rate.interval,
                           "failed": {str(r.seed): [r.cause, r.message] for r in groups[name] if r.cause != SUCCESS}}
@@ -124,11 +122,14 @@ def _figures(effort: Effort, groups: dict[str, list[RunResult]]) -> list[Section
                   f"{math.degrees(contact[0].tilt_error):.1f} deg", "0.4-0.6 m/s planned")
     rates, fast = (Spread.from_values(r.metrics.get("max_body_rate_deg_s") for r in groups[name]) for name in ("surface_90", AGGRESSIVE))
     peaks = Spread.from_values(r.metrics.get("max_acceleration_m_s2") for r in groups["surface_90"])
-    six.show("largest body rate, `surface_90`", rates.to_text(1.0, 0, "deg/s"))
+    impact = extended_mapping("scenarios", AGGRESSIVE)["parameters"]["perching_planner"]["impact_acceleration"]
+    six.compare("largest body rate, `surface_90`", rates.to_text(1.0, 0, "deg/s"), f"close to {PEAK_RATE:g} deg/s", rates.median >= PEAK_RATE,
+                "like for like: 90 deg, 1.7 m, the paper's impact acceleration")
     six.claim(f"largest body rate, `{AGGRESSIVE}`", fast.to_text(1.0, 0, "deg/s"), f"close to {PEAK_RATE:g} deg/s",
-              0.9 * PEAK_RATE <= fast.median <= 1.1 * PEAK_RATE if groups[AGGRESSIVE] else None, "within 10 % of the paper's")
+              0.9 * PEAK_RATE <= fast.median <= 1.1 * PEAK_RATE if groups[AGGRESSIVE] else None,
+              f"within 10 % of the paper's; this scenario's impact acceleration, {impact:g} m/s^2, was chosen to reach the rate")
     held = Rate.from_outcomes(r.cause == SUCCESS for r in groups[AGGRESSIVE])
-    six.claim(f"perches, `{AGGRESSIVE}`", str(held), "", held.value >= 0.95 if held.trials else None, "at least 95 %")
+    six.claim(f"perches, `{AGGRESSIVE}`", str(held), "", held.at_least(0.95), "at least 95 %")
     six.claim("largest acceleration", peaks.to_text(1.0, 1, "m/s^2"), f"up to {PEAK_ACCELERATION:g} m/s^2", peaks.median >= 0.7 * PEAK_ACCELERATION,
               "at least 70 % of the paper's")
     return [five, six]

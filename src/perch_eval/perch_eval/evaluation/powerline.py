@@ -36,15 +36,15 @@ def _table(effort: Effort) -> Section:
     count = 50 if effort.full else 5
     out = Section("p_table_1", "[P] Table I: planning time of perch and recovery",
                   f"{count} random starts around the nominal one for each row (generator seeds 1 to {count}); median [range] of the "
-                  "solver's wall-clock time on this machine, compiled functions loaded. Each plan is re-integrated at 1 ms and "
-                  "checked between the nodes. The paper: 5 experiments on a Jetson TX2.")
+                  "solver's wall-clock time on this machine, compiled functions loaded. Each plan is re-integrated at 1 ms; one "
+                  "that violates a limit there is refused. The paper: 5 experiments on a Jetson TX2.")
     vehicle = load_vehicle("rpg")
     planner = PowerlinePlanner(vehicle)
     planner.warm_up()
     for case, (_, _, paper_perch, paper_recovery) in TABLE.items():
         setup = problem.load(f"powerline_{case}")
         nominal = setup.request(vehicle)
-        perch, recovery, violated, refused = [], [], 0, []
+        perch, recovery, refused = [], [], []
         for seed in range(1, count + 1):
             try:
                 plan = planner.plan(random_start(nominal, setup, vehicle, np.random.default_rng(seed)))
@@ -56,14 +56,12 @@ def _table(effort: Effort) -> Section:
                 continue
             perch.append(plan.perch.solve_time)
             recovery.append(plan.recovery.solve_time)
-            violated += sum(not bound.holds for bound in plan.bounds)
         out.data[case] = {"perch_s": perch, "recovery_s": recovery, "refused": refused}
         for name, values, paper in (("perch", perch, paper_perch), ("recovery", recovery, paper_recovery)):
             spread = Spread.from_values(1e3 * v for v in values)
             out.claim(f"{TITLES[case]}: {name}", spread.to_text(1.0, 0, "ms"), f"{paper} ms", spread.median <= paper,
                       "median at most the paper's")
-        out.claim(f"{TITLES[case]}: starts solved, limits kept between nodes", f"{len(perch)}/{count}, {violated} violations",
-                  "", len(perch) == count and violated == 0, "; ".join(refused) or "all, none")
+        out.claim(f"{TITLES[case]}: starts solved", f"{len(perch)}/{count}", "", len(perch) == count, "; ".join(("all", *refused)))
     return out
 
 
@@ -108,8 +106,10 @@ def flown_sections(effort: Effort) -> list[Section]:
             words = "; ".join(f"seed {r.seed}: {r.cause}: {r.message}" for r in without_grip if not recovered(r))
             out.claim(f"{name}, grip switched off: recoveries to a hover", f"{sum(map(recovered, without_grip))} of {len(without_grip)}", "",
                       not words, words or "all")
-        others = int(sum(r.metrics.get("other_lines_touched") or 0.0 for r in runs + without_grip))
-        out.claim(f"{name}: contacts with other lines", f"{others}", "", others == 0, "none")
+        touched = [value for r in runs + without_grip if (value := r.metrics.get("other_lines_touched")) is not None]
+        count = len(runs + without_grip)
+        out.claim(f"{name}: contacts with other lines", f"{sum(touched):.0f} ({len(touched)} of {count} flights)", "",
+                  sum(touched) == 0 and len(touched) == count if count else None, "none, every flight is carried out")
         out.data[case] = [{"seed": r.seed, "grips": r.values["grips"], "cause": r.cause, "outcome": r.outcome, "message": r.message, **r.metrics}
                           for r in runs + without_grip]
     return [out]
@@ -136,7 +136,8 @@ def _published() -> Section:
 
 def _pictures(effort: Effort) -> list[Section]:
     """Return Fig. 6 and 7 (80 deg without and with perception awareness) and Fig. 8 (upside down), as planned."""
-    seven = Section("p_fig_6_7", "[P] Fig. 6 and 7: the line in view at 80 deg", "As planned from the nominal start; not flown.")
+    seven = Section("p_fig_6_7", "[P] Fig. 6 and 7: the line in view at 80 deg",
+                    "As planned from the nominal start; not flown. A line beyond the image's corners, or behind the camera, counts as at them.")
     eight = Section("p_fig_8", "[P] Fig. 8: perching upside down", "As planned from the nominal start; not flown.")
     means = {}
     for case, section in (("line_80", seven), ("line_80_pa", seven), ("line_180", eight)):
@@ -151,12 +152,12 @@ def _pictures(effort: Effort) -> list[Section]:
             mount = planned.vehicle.mounts[planned.problem.settings.camera]
             measures = visibility(planned.plan.perch.states, planned.request.target(), mount)
             means[case] = measures.summary()
-            section.show(f"{TITLES[case]}: mean reprojection error, line at the centre", f"{means[case]['mean_reprojection_px']:.0f} px, "
-                         f"{100 * means[case]['segment_share']:.0f} % of the time")
+            section.show(f"{TITLES[case]}: mean reprojection error", f"{means[case]['mean_reprojection_px']:.0f} px")
+            for name, key in (("a part of the line in the image", "seen_share"), ("nearest point on the segment (14i)", "segment_share")):
+                section.show(f"{TITLES[case]}: {name}", f"{100 * means[case][key]:.0f} % of the time")
         else:
             low = next(b for b in planned.plan.bounds if b.quantity == "height")
-            section.claim("lowest height of the perch", f"{low.minimum:.3f} m", ">= 0.8 m", low.holds, "kept between the nodes, at 1 ms")
-            section.claim("every limit", f"{len(planned.plan.bounds)} certificates", "", all(b.holds for b in planned.plan.bounds), "all hold")
+            section.show("lowest height of the perch", f"{low.minimum:.3f} m", ">= 0.8 m", "a plan that violates a limit at 1 ms is refused")
     seven.claim("perception awareness lowers the reprojection error",
                 f"{means['line_80']['mean_reprojection_px']:.0f} -> {means['line_80_pa']['mean_reprojection_px']:.0f} px", "lower",
                 means["line_80_pa"]["mean_reprojection_px"] < means["line_80"]["mean_reprojection_px"], "as in Fig. 7")

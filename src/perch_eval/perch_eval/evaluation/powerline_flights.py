@@ -17,18 +17,21 @@ from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task, fly_in_process
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
+from perch_eval.control_flights.aborted import MAX_HOVER_SPEED
 from perch_eval.evaluation.kept import cached_runs
 from perch_eval.evaluation.sections import Effort
 from perch_eval.flight import Flight
 from perch_eval.in_process import Sensing
 from perch_eval.metrics import MISSION, contact_of
 from perch_sim.cable_contact import CableLine
+from perch_sim.contact_event import ContactState
 from perch_sim.scenario import Scenario
 
 ENGINE = "perch_eval.evaluation.powerline_flights:fly_line"
 RENDERED = Sensing(vio="rendered", target="rendered")
 CASES_WITHOUT_GRIP = ("line_80", "line_20", "line_180")  # also flown with a gripper that never closes: all must recover
 SEEDS_WITHOUT_GRIP = 3
+LEAST_HEIGHT = 0.8  # of a hover at the end [m]
 MAP_RADIUS = 1.5  # around the target point within which the map is judged [m]
 
 
@@ -39,7 +42,7 @@ def fly_line(task: Task) -> RunResult:
 
 def _errors(flight: Flight, scenario: Scenario, vehicle: Vehicle) -> dict[str, float | None]:
     return {**perching_errors(flight, scenario, vehicle.wire_offset), **mapping_errors(flight, scenario),
-            "other_lines_touched": float(_others_touched(flight, scenario))}
+            "other_lines_touched": float(_others_touched(flight, scenario)), "hovers_at_end": float(hovers_at_end(flight))}
 
 
 def _target(scenario: Scenario) -> int:
@@ -127,9 +130,16 @@ def mapping_errors(flight: Flight, scenario: Scenario) -> dict[str, float | None
             "mapping_in_map_m": float(np.mean([cable.nearest(p).distance for p in samples]))}
 
 
+def hovers_at_end(flight: Flight) -> bool:
+    """Return whether the true vehicle is slow, high enough and not held by a wire at the end."""
+    truth = flight.states("ground_truth/odometry")
+    held = any(c.state == ContactState.ATTACHED for _, c in flight.values("contact")[-1:])
+    return truth is not None and not held and float(np.linalg.norm(truth.v[-1])) < MAX_HOVER_SPEED and float(truth.p[-1, 2]) > LEAST_HEIGHT
+
+
 def recovered(run: RunResult) -> bool:
-    """Return whether a flight that did not grip ended in a hover."""
-    return run.outcome == "missed" and run.cause != "crash" and run.message.endswith("hover")
+    """Return whether a flight that did not grip ended in a hover, in truth."""
+    return run.outcome == "missed" and run.cause != "crash" and run.metrics.get("hovers_at_end") == 1.0
 
 
 def flights(effort: Effort, cases: tuple[str, ...]) -> dict[tuple[str, bool], list[RunResult]]:

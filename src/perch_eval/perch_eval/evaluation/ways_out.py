@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from itertools import pairwise
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from perch_control.mission.settings import MissionSettings
+from perch_control.mission.ways_out import DECISION
 from perch_core.errors import PlanningRefusal
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
@@ -21,6 +21,7 @@ from perch_eval.evaluation.document import table, write_page
 from perch_eval.evaluation.kept import cached_figures
 from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.parameters import NodeParameters
+from perch_eval.statistics import Rate
 from perch_planner.perching_planner import PerchingPlannerParameters
 from perch_planner.planner import plan
 from perch_planner.powerline import problem
@@ -38,6 +39,7 @@ EDGES = (0.0, 0.05, 0.1, 0.15, 0.3, 0.5, 0.7, 1.0, math.inf)  # of time to conta
 CANCELLED_FLIGHTS = {"surface_60": 8, "surface_90": 12, "line_80": 2}  # flights that are cancelled, each at another time
 MAX_TIME_TO_CONTACT = 1.4                                 # at which the first of them is cancelled [s]
 NO_CONTACT_BEFORE = MissionSettings().contact_early       # nearer to the contact a surface may already be touched [s]
+TOO_LATE = NO_CONTACT_BEFORE + DECISION                   # cancelled nearer to the contact, no way out can begin in time [s]
 REQUIRED_SHARE = 0.99                                     # share of the instants before that with a way out
 INTERVAL = re.compile(r"\[(\S+), (\S+)\]")  # that was found, in a refusal
 
@@ -70,26 +72,26 @@ def sections(effort: Effort) -> list[Section]:
         early = [x for x in instants if x.time_to_contact >= NO_CONTACT_BEFORE]
         planned = sum(not r["refused"] for r in plans)
         out.claim(f"{title}: a way out {NO_CONTACT_BEFORE:g} s before contact and earlier", f"{_share(early)}; {planned} of {len(plans)} planned", "",
-                  planned == len(plans) and sum(not x.refusal for x in early) >= REQUIRED_SHARE * len(early) if early or planned < len(plans) else None,
+                  planned == len(plans) and Rate.from_outcomes(not x.refusal for x in early).at_least(REQUIRED_SHARE),
                   f"at least {100 * REQUIRED_SHARE:g} %, all planned")
-    flown = cached_figures(effort, "aborted", list(_cancellations()), _fly_cancelled, lambda r: r["end"] in ("hovering", "attached"))
+    flown = cached_figures(effort, "aborted", list(_cancellations()), _fly_cancelled, lambda r: r["end"] == "hovering" or _too_late(r))
     text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
             *table(" | ".join(("plans", *(f"{low:g} to {high:g}" for low, high in pairwise(EDGES[:-1])), f"from {EDGES[-2]:g}", "all")), rows), "",
             "## Refused", ""]
     text += _counted(reasons) or ["None."]
     text += ["", "## Cancelled flights", "", "The goal is cancelled on the way (modelled cameras, seeds from 1). *by a way out*: the controller left the "
-             "plan by a planned way out; *attached*: cancelled too late, the perch went on.", ""]
+             f"plan by a planned way out; *too late*: cancelled within {TOO_LATE:g} s of the contact, no way out was planned, and the perch went on.", ""]
     rows = []
     for name, n in CANCELLED_FLIGHTS.items():
         own = [r for r in flown if r["scenario"] == name]
-        ends = Counter(r["end"] for r in own)
+        hovering, late = [r for r in own if r["end"] == "hovering"], sum(map(_too_late, own))
         left = [r for r in own if r["planned"]]
-        rows.append((name, n, ends["hovering"], sum(r["planned"] for r in own if r["end"] == "hovering"), ends["attached"],
-                     n - ends["hovering"] - ends["attached"], f"{min((r['margin'] for r in left), default=math.nan):.2f}",
-                     f"{max((r['rate'] for r in left), default=math.nan):.1f}"))
-        out.claim(f"{name}: cancelled on the way", f"{ends['hovering']} hovering, {ends['attached']} attached of {n}", "",
-                  ends["hovering"] + ends["attached"] == n, "all")
-    text += table("scenario | n | hovering | of these by a way out | attached | other | least thrust margin | largest body rate [rad/s]", rows)
+        rows.append((name, n, len(hovering), sum(r["planned"] for r in hovering), late, n - len(hovering) - late,
+                     f"{min((r['margin'] for r in left), default=math.nan):.2f}", f"{max((r['rate'] for r in left), default=math.nan):.1f}"))
+        others = [f"seed {r['seed']}, {r['before']:.2f} s before contact: {r['end']}" for r in own if r["end"] != "hovering" and not _too_late(r)]
+        out.claim(f"{name}: cancelled on the way", f"{len(hovering)} hovering, {late} too late and attached, of {n}", "",
+                  len(hovering) + late == n, "; ".join(("all; too late: see [way_out.md](way_out.md)", *others)))
+    text += table("scenario | n | hovering | of these by a way out | attached, too late | other | least thrust margin | largest body rate [rad/s]", rows)
     text += ["", *table("scenario | seed | cancelled before contact [s] | end | by a way out | goal ended after [s] | message of the mission", (
         (r["scenario"], r["seed"], f"{r['before']:.2f}", r["end"], "yes" if r["planned"] else "no", f"{r['settled']:.2f}", r["message"]) for r in flown))]
     write_page(effort, "way_out", text, {"plans": made, "flights": flown})
@@ -123,6 +125,11 @@ def _cancellations() -> Iterator[tuple[str, int, float]]:
     for name, n in CANCELLED_FLIGHTS.items():
         for k in range(n):
             yield name, k + 1, round(MAX_TIME_TO_CONTACT * (1.0 - (k + 0.5) / n), 3)
+
+
+def _too_late(r: dict[str, Any]) -> bool:
+    """Return whether a flight is attached because it was cancelled when no way out could begin before the contact."""
+    return r["end"] == "attached" and r["before"] < TOO_LATE and not r["planned"]
 
 
 def _fly_cancelled(job: tuple[str, int, float]) -> dict[str, Any]:

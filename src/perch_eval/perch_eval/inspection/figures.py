@@ -44,13 +44,13 @@ def metrics_figure(flight: InspectionResult) -> Figure:
     for times, judged, colour, style, label in ways:
         measures = judged.visibility
         panels[0].plot(times, judged.clearance, color=colour, ls=style, label=label)
-        panels[1].plot(times, np.minimum(measures.reprojection, judged.corner), color=colour, ls=style,
+        panels[1].plot(times, measures.reprojection, color=colour, ls=style,
                        label=f"{label}, mean {judged.reprojection:.0f} px")
         panels[2].plot(times, measures.cheirality.astype(int), color=colour, ls=style)
         panels[3].plot(times, measures.segment.astype(int), color=colour, ls=style)
     panels[0].axhspan(-1.0, 0.0, color=COLLISION, alpha=0.2)
     panels[0].set(ylabel="scaled clearance", ylim=(-1.0, 3.0), title="inspection")
-    panels[1].set(ylabel="|reprojection| [px]", ylim=(0.0, None))
+    panels[1].set(ylabel=f"|reprojection| [px],\nat most {measures.corner:.0f} (corner)", ylim=(0.0, None))
     for panel, name in ((panels[2], "cheirality"), (panels[3], "segment visibility")):
         panel.axhspan(-0.2, 0.5, color=COLLISION, alpha=0.2)
         panel.set(ylabel=name, yticks=[0, 1], yticklabels=["violated", "holds"], ylim=(-0.2, 1.2))

@@ -65,12 +65,10 @@ class Judgement:
     Attributes:
         clearance: scaled clearance of the nearest line, shape (n,). [P:eq7]
         visibility: visibility of the watched line at n states.
-        corner: distance of the image's corners from its centre [px].
     """
 
     clearance: np.ndarray
     visibility: Visibility
-    corner: float
 
     @property
     def collisions(self) -> int:
@@ -79,16 +77,14 @@ class Judgement:
 
     @property
     def reprojection(self) -> float:
-        """Mean distance of the watched line from the image centre [px], limited to that of the image's corners, which also counts
-        for a line behind the camera: a path into the line does not weigh more than one past it. [P:eq9]"""
-        return float(np.mean(np.where(self.visibility.cheirality, np.minimum(self.visibility.reprojection, self.corner), self.corner)))
+        """Mean limited distance of the watched line from the image centre [px]: a path into the line does not weigh more than one past
+        it. [P:eq9]"""
+        return float(self.visibility.reprojection.mean())
 
 
 def judge(states: np.ndarray, lines: Sequence[Segment], line: Segment, vehicle: Vehicle) -> Judgement:
     """Compute the measures of states p, q, ..., shape (n, >= 7), with the true lines; `line` is the watched one."""
-    mount = vehicle.mounts["front"]
-    return Judgement(clearance(states, lines, vehicle.body_radii), visibility(states, line, mount),
-                     float(np.hypot(mount.camera.width, mount.camera.height)) / 2)
+    return Judgement(clearance(states, lines, vehicle.body_radii), visibility(states, line, vehicle.mounts["front"]))
 
 
 @dataclass(frozen=True)

@@ -103,10 +103,10 @@ def draw_visibility(planned: PlannedProblem, path: Path, without: Manoeuvre | No
         perches.append((without, RECOVERY, "without"))
     for part, colour, label in perches:
         metrics = visibility(part.states, planned.request.target(), mount)
-        top.plot(part.times, np.where(metrics.cheirality, np.minimum(metrics.reprojection, 2000), np.nan), color=colour, label=label)
+        top.plot(part.times, metrics.reprojection, color=colour, label=label)
         middle.plot(part.times, metrics.in_image, color=colour)
         bottom.plot(part.times, np.where(metrics.segment & metrics.cheirality, 1, 0), color=colour)
-    top.set(ylabel="|reprojection| [px]", yscale="symlog", title=planned.problem.description or planned.problem.name)
+    top.set(ylabel=f"|reprojection| [px],\nat most {metrics.corner:.0f} (corner)", yscale="symlog", title=planned.problem.description or planned.problem.name)
     top.legend(fontsize=8)
     middle.set(ylabel="share in\nimage", ylim=(-0.05, 1.05))
     bottom.set(xlabel="time [s]", ylabel="constraints (12), (13)", yticks=[0, 1], yticklabels=["violated", "hold"], ylim=(-0.1, 1.1))

@@ -19,24 +19,26 @@ class Visibility:
     """Line metrics along a trajectory.
 
     Attributes:
-        reprojection: distance of the line from the image centre [px], shape (m,). [P:eq9]
+        reprojection: distance of the line from the image centre [px], shape (m,), limited to that of the image's corners, which also
+            counts for a line behind the camera. [P:eq9]
         cheirality: h_lc > 0: the line is in front, shape (m,). [P:eq12]
         segment: the segment is at the centre, shape (m,). [P:eq13]
         in_image: share of the segment's sample points inside the image, shape (m,).
+        corner: distance of the image's corners from its centre [px].
     """
 
     reprojection: np.ndarray
     cheirality: np.ndarray
     segment: np.ndarray
     in_image: np.ndarray
+    corner: float
 
     def summary(self) -> dict[str, float]:
-        """Shares of the time and the mean reprojection error while the line is in front."""
-        front = self.cheirality
+        """Shares of the time and the mean reprojection error."""
         return {
-            "cheirality_share": float(front.mean()),
-            "segment_share": float((self.segment & front).mean()),
-            "mean_reprojection_px": float(self.reprojection[front].mean()) if front.any() else float("nan"),
+            "cheirality_share": float(self.cheirality.mean()),
+            "segment_share": float((self.segment & self.cheirality).mean()),
+            "mean_reprojection_px": float(self.reprojection.mean()),
             "seen_share": float((self.in_image > 0).mean()),
         }
 
@@ -65,4 +67,5 @@ def visibility(states: np.ndarray, line: lines.Segment, mount: CameraMount) -> V
         in_image[k] = inside.mean()
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.abs(lines.reprojection_error(n_I))
-    return Visibility(error, lines.cheirality(n_I, l_I) > 0, np.abs(place) < np.abs(depth), in_image)
+    front, corner = lines.cheirality(n_I, l_I) > 0, float(np.hypot(mount.camera.width, mount.camera.height)) / 2
+    return Visibility(np.where(front, np.fmin(error, corner), corner), front, np.abs(place) < np.abs(depth), in_image, corner)
