@@ -121,10 +121,10 @@ def ending(now: Situation) -> str:
 
 
 def first_report(case: Case, fault_time: float, lines: Iterable[str], received: Iterable[tuple[float, str]]) -> tuple[float, str] | None:
-    """Return the delay [s] and text of the first report that names the fault_time node or its messages; None: there is none.
+    """Return the delay [s] and text of the first report that names the struck node or its messages; None: there is none.
 
     Args:
-        case: the case; log lines of the fault_time node itself do not count.
+        case: the case; log lines of the struck node itself do not count.
         fault_time: time of the fault, seconds since the epoch.
         lines: lines of all logs, each with level, seconds since the epoch and node.
         received: (seconds since the epoch, text) received by the pilot, which sent the goal.

@@ -47,15 +47,15 @@ class Row:
     Attributes:
         fault, node, phase, mode, seed: the case.
         commit: commit of the code.
-        injection_wall_time: simulation time of the fault [s]; None: the flight ended before.
+        struck: simulation time of the fault [s]; None: the flight ended before.
         before: height [m], speed [m/s] and tilt [deg] at the fault.
         end: hovering, landed, perched or motors off; any other end is not safe.
-        first_report: wall-clock time from the fault to its first report [s]; None: it was not reported.
+        named: wall-clock time from the fault to its first report [s]; None: it was not reported.
         words: source and text of that report.
         goal: the mission's result, or the pilot's error message.
         impact: largest normal speed of a contact with the floor or a wall after the fault [m/s].
-        ended_processes: other nodes that ended by themselves.
-        leftovers: processes, sockets and shared memory that remained after all nodes were stopped.
+        ended: other nodes that ended by themselves.
+        left: processes, sockets and shared memory that remained after all nodes were stopped.
         duration: wall-clock time of the flight [s].
     """
 
@@ -78,13 +78,13 @@ class Row:
 
 
 class _FaultInjector:
-    """Applies the fault injection_time its time.
+    """Applies the fault when its time has come.
 
     Attributes:
         received: (seconds since the epoch, text) received by the pilot.
         injection_wall_time: time of the fault, seconds since the epoch; None: not yet.
         injection_time: the same in simulation time [s].
-        before: situation injection_time the fault.
+        before: situation at the fault.
     """
 
     def __init__(self, case: Case, group: Group, watcher: Watcher, takeoff_height: float, pad: Any) -> None:
