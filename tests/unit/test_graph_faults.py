@@ -22,6 +22,7 @@ from perch_eval.graph_faults.cases import (
 from perch_eval.graph_faults.flight import UNANSWERED, _FaultInjector
 from perch_eval.graph_faults.relay_node import DELAY, Disturbance
 from perch_eval.fork_server import alive, session, start
+from perch_sim.contact import CRASH_SPEED
 
 CASE = Case("kill", "estimator", "climb", LOCKSTEP)
 CODE = {"commit": "1234567", "digest": "now"}
@@ -98,6 +99,16 @@ def row(**changes) -> dict:
 def test_what_is_not_as_it_should_be_is_said(changes, problem):
     assert campaign.problems(row(**changes)) == problem
     assert all(word in campaign.page([row(**changes)]) for word in problem)
+
+
+def test_a_vehicle_that_hits_the_floor_faster_than_it_survives_has_crashed_also_in_rows_of_earlier_flights(tmp_path):
+    file = tmp_path / campaign.ROWS
+    file.write_text("".join(json.dumps(row(node=node, end=end, impact=impact)) + "\n" for node, end, impact in (
+        ("controller", "landed", CRASH_SPEED + 0.01), ("mission", "motors off", CRASH_SPEED + 2.0), ("estimator", "landed", CRASH_SPEED))))
+    ends = {case.node: one["end"] for case, one in campaign.load(file).items()}
+    assert ends == {"controller": "crashed", "mission": "crashed", "estimator": "landed"} and "crashed" not in SAFE
+    page = campaign.page(list(campaign.load(file).values()))
+    assert "**1 of 3 end safely**" in page and page.count("ended crashed") == 2
 
 
 def test_a_killed_campaign_keeps_what_was_flown(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from typing import Any
 from perch_core.errors import PerchError
 from perch_eval.domain import domain_in_environment
 from perch_eval.fork_server import alive
-from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, REPORT_LIMIT, SAFE, Case, Situation, ending, first_report
+from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, REPORT_LIMIT, SAFE, Case, Situation, ending, first_report, judged_end
 from perch_eval.graph_faults.group import Group
 from perch_eval.graph_faults.ros.watcher import Watcher
 from perch_eval.modelled_sight_node import imageless_launches
@@ -49,7 +49,7 @@ class Row:
         commit: commit of the code.
         struck: simulation time of the fault [s]; None: the flight ended before.
         before: height [m], speed [m/s] and tilt [deg] at the fault.
-        end: hovering, landed, perched or motors off; any other end is not safe.
+        end: hovering, landed, perched or motors off; any other end is not safe, such as crashed.
         named: wall-clock time from the fault to its first report [s]; None: it was not reported.
         words: source and text of that report.
         goal: the mission's result, or the pilot's error message.
@@ -198,9 +198,10 @@ def fly(case: Case, folder: Path, commit: str) -> Row:
              if injector.injection_wall_time is not None else None)
     impacts = [c.normal_speed for c in watcher.contacts if c.state in (ContactState.COLLISION, ContactState.GROUND)
                and injector.injection_time is not None and 1e-9 * c.stamp >= injector.injection_time]
+    impact = round(max(impacts, default=0.0), 2)
     after, words = (None, "") if found is None else (round(found[0], 2), found[1][:300])
-    return Row(*case, case.seed, commit, injector.injection_time, injector.before[:3], end, after, words, goal[:300],
-               round(max(impacts, default=0.0), 2), ended, left, round(time.monotonic() - began, 1))
+    return Row(*case, case.seed, commit, injector.injection_time, injector.before[:3], judged_end(end, impact),
+               after, words, goal[:300], impact, ended, left, round(time.monotonic() - began, 1))
 
 
 def _wait_for_end(pilot: MissionClient, watcher: Watcher, injector: _FaultInjector) -> str:
