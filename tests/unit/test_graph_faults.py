@@ -111,6 +111,12 @@ def test_a_vehicle_that_hits_the_floor_faster_than_it_survives_has_crashed_also_
     assert "**1 of 3 end safely**" in page and page.count("ended crashed") == 2
 
 
+def test_shares_of_named_faults_are_of_all_faults_whatever_became_of_the_flight():
+    page = campaign.page([row(), row(named=None), row(fault="drop", goal="perched: perched", named=None), row(fault="drop", named=1.0)])
+    assert "**1 of 2 faults of processes are named within 5 s**" in page and " 1 of 2 disturbances of messages" in page
+    assert " 1 disturbances that are not named had no effect" in page
+
+
 def test_a_killed_campaign_keeps_what_was_flown(tmp_path, monkeypatch):
     file = tmp_path / campaign.ROWS
     file.write_text(json.dumps(row()) + "\n" + json.dumps(row(node="mission"))[:50])

@@ -18,7 +18,7 @@ from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.evaluation.document import machine, table
-from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, PHASES, REAL_TIME, REPORT_LIMIT, SAFE, TRAFFIC, Case, cases, judged_end
+from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, PHASES, PROCESS, REAL_TIME, REPORT_LIMIT, SAFE, TRAFFIC, Case, cases, judged_end
 from perch_eval.graph_faults.flight import fly
 from perch_eval.revision import banner, code_version
 from perch_eval.rows import Rows, rows_of
@@ -123,15 +123,20 @@ def problems(row: dict[str, Any]) -> list[str]:
     if row["struck"] is None:
         return [f"the flight ended before the fault: {row['goal']}"]
     found = [] if row["end"] in SAFE else [f"ended {row['end']}"]
-    if (row["named"] is None or row["named"] > REPORT_LIMIT) and not without_effect(row):
+    if not in_time(row) and not without_effect(row):
         found.append("not named" if row["named"] is None else f"named after {row['named']:.1f} s")
     found += [f"{name} ended, too" for name in row["ended"]] + [f"left: {one}" for one in row["left"]]
     return found
 
 
+def in_time(row: dict[str, Any]) -> bool:
+    """Return whether the fault was named in time."""
+    return row["named"] is not None and row["named"] <= REPORT_LIMIT
+
+
 def without_effect(row: dict[str, Any]) -> bool:
     """Return whether disturbed messages were not reported in time, but had no effect: the flight perched."""
-    return row["fault"] in TRAFFIC and row["goal"].startswith("perched") and (row["named"] is None or row["named"] > REPORT_LIMIT)
+    return row["fault"] in TRAFFIC and row["goal"].startswith("perched") and not in_time(row)
 
 
 def _ends(rows: Sequence[dict[str, Any]]) -> str:
@@ -144,8 +149,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     struck = [row for row in rows if row["struck"] is not None]
     crashed = Counter(row["node"] for row in struck if row["end"] == "crashed")
     safe = [row for row in struck if row["end"] in SAFE]
-    unaffected = [row for row in struck if without_effect(row)]
-    reported = [row for row in struck if row["named"] is not None and row["named"] <= REPORT_LIMIT]
+    of_processes, of_messages = ([in_time(row) for row in struck if row["fault"] in kind] for kind in (PROCESS, TRAFFIC))
+    unaffected = sum(map(without_effect, struck))
     clean = [row for row in rows if not row["left"]]
     commits, others = Counter(row["commit"] for row in rows), sum(bool(row["ended"]) for row in rows)
     text = ["# Faults on the real graph", "", banner(commits, [row.get("code", "") for row in rows]), "",
@@ -155,9 +160,10 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             f"* **{len(safe)} of {len(struck)} end safely**: hovering, landed, perched, or with the motors off on the ground.",
             *([f"  Crashed, with an impact of more than {CRASH_SPEED:g} m/s, {crashed.total()}; struck were: "
                + ", ".join(f"{node} ({n})" for node, n in crashed.items()) + "."] if crashed else []),
-            f"* **{len(reported)} of {len(struck) - len(unaffected)} are named within {REPORT_LIMIT:g} s** of the wall clock: a node, or the sender of the",
-            "  goal, names the missing node or messages. Reports by the faulted node or by the launcher are not counted.",
-            f"  Not counted: {len(unaffected)} flights whose messages were disturbed and that perched as if they had not been.",
+            f"* **{sum(of_processes)} of {len(of_processes)} faults of processes are named within {REPORT_LIMIT:g} s** of the wall clock, and "
+            f"{sum(of_messages)} of {len(of_messages)} disturbances of messages:",
+            "  a node, or the sender of the goal, names the missing node or messages. Reports by the faulted node or by the launcher",
+            f"  are not counted. {unaffected} disturbances that are not named had no effect: the vehicle perched. These are no failures.",
             f"* **{len(clean)} of {len(rows)} leave no residue**: no process, no socket of the lockstep, no shared memory in the end.",
             f"* In {others} flights a node that was not struck ended." if others else "* No other node ended in any flight.",
             "", "The node that is struck has a process of its own. In a quarter of the flights all others have, too; in the rest those",
