@@ -20,6 +20,7 @@ from perch_eval.graph_faults import campaign
 from perch_eval.graph_faults.cases import (
     FAULTS, LOCKSTEP, MODES, NODE_PATTERNS, NODES, PHASES, PROCESS, REAL_TIME, SAFE, Case, Situation, cases, ending, first_report)
 from perch_eval.graph_faults.flight import UNANSWERED, _FaultInjector
+from perch_eval.graph_faults.group import Group
 from perch_eval.graph_faults.relay_node import DELAY, Disturbance
 from perch_eval.fork_server import alive, session, start
 from perch_sim.contact import CRASH_SPEED
@@ -180,6 +181,18 @@ def test_a_goal_whose_mission_is_gone_is_followed_until_the_fault_has_had_its_ti
         injector.injection_wall_time = 1000.0 - after
         with nullcontext() if followed else pytest.raises(PerchError, match=UNANSWERED):
             injector.check_goal()
+
+
+def test_a_process_that_has_to_be_killed_at_the_end_is_residue(monkeypatch):
+    monkeypatch.setattr("perch_eval.graph_faults.group.STOP_TIMEOUTS", (1.0, 60.0))
+    ends, ignores = (subprocess.Popen([sys.executable, "-c", f"import signal, time; signal.signal(signal.SIGINT, signal.{handler}); "
+                                       "print(flush=True); time.sleep(300)"], stdout=subprocess.PIPE) for handler in ("SIG_DFL", "SIG_IGN"))
+    ends.stdout.readline(), ignores.stdout.readline()
+    group = Group((), CASE, Path(), 43)
+    group.pids = {"mission": ends.pid, "controller": ignores.pid}
+    group.stop()
+    assert (ends.wait(), ignores.wait()) == (-signal.SIGINT, -signal.SIGKILL)
+    assert group.leftovers() == ("process controller after SIGINT",)
 
 
 def test_processes_of_a_fork_server_are_their_own(tmp_path, monkeypatch):

@@ -165,6 +165,8 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             "  a node, or the sender of the goal, names the missing node or messages. Reports by the faulted node or by the launcher",
             f"  are not counted. {unaffected} disturbances that are not named had no effect: the vehicle perched. These are no failures.",
             f"* **{len(clean)} of {len(rows)} leave no residue**: no process, no socket of the lockstep, no shared memory in the end.",
+            "  Before it is counted, the campaign removes the shared memory of these processes that is unused, as `demo.py` does: one that is",
+            "  killed cannot.",
             f"* In {others} flights a node that was not struck ended." if others else "* No other node ended in any flight.",
             "", "The node that is struck has a process of its own. In a quarter of the flights all others have, too; in the rest those",
             "that do not use images share one, as in `demo.py`. Cameras are off; VIO and tags are replaced by their error models",
