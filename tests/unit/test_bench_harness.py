@@ -37,6 +37,23 @@ def test_malformed_figures_are_refused():
         harness.figure("a", "ms", [1.0], bar=1.0, comparison="mean <")
 
 
+def test_a_powerline_perch_without_recovery_is_not_solved(monkeypatch):
+    from perch_core.errors import PlanningRefusal
+
+    monkeypatch.setitem(sys.modules, "powerline_ipopt", SimpleNamespace())
+    powerline = importlib.import_module("powerline")
+    part = SimpleNamespace(cpu_time=0.01, solve_time=0.01, iterations=9, bounds=())
+    plans = [SimpleNamespace(perch=part, recovery=recovery, bounds=(), without_recovery="no room") for recovery in (part, None)]
+    answers = [powerline._answer(SimpleNamespace(plan=lambda _, plan=plan: plan), None) for plan in plans]
+
+    def refuse(_):
+        raise PlanningRefusal("solver", "perch", -1.0, "none")
+
+    answers.append(powerline._answer(SimpleNamespace(plan=refuse), None))
+    assert [bool(answer["missing"]) for answer in answers] == [False, True, True] and answers[1]["missing"] == "no recovery: no room"
+    assert [bool(answer["refusal"]) for answer in answers] == [False, False, True]  # starts anywhere: perches alone
+
+
 def test_measure_counts_only_after_the_warm_up():
     calls = []
     times = harness.measure(lambda: calls.append(None), repetitions=7, warm_up=2)
