@@ -123,6 +123,30 @@ def test_a_page_is_of_the_code_with_which_its_flights_began(parts, monkeypatch):
     assert json.loads(Path("results/results.json").read_text())["digest"] == "0123456789ab"
 
 
+@pytest.mark.parametrize("arguments, folder", [([], "out/results"), (["--full", "--only", "a"], "out/results"), (["--full"], "docs/results")])
+def test_only_an_evaluation_of_everything_replaces_the_committed_page_by_default(parts, arguments, folder):
+    parts(a=part(True), b=part(True))
+    assert command.main(arguments) == 0
+    assert {str(page) for page in Path().rglob("README.md")} == {f"{folder}/README.md"}
+
+
+def test_an_interrupted_evaluation_leaves_pages_and_figures_as_they_were(parts):
+    def drawing(effort):
+        (effort.out / "figure.png").write_text("new")
+        if interrupts:
+            raise KeyboardInterrupt
+        return part(True)(effort)
+
+    parts(a=drawing)
+    Path("results").mkdir()
+    for name in ("figure.png", "README.md", "notes.txt"):
+        Path("results", name).write_text("old")
+    for interrupts, code, content in ((True, 130, ["old", "old", "old"]), (False, 0, ["new", "# Res", "old"])):
+        assert command.main(["--out", "results"]) == code
+        assert [Path("results", name).read_text()[:5] for name in ("figure.png", "README.md", "notes.txt")] == content
+    assert {file.name for file in Path("results").iterdir()} == {"figure.png", "README.md", "notes.txt", "results.json"}
+
+
 def test_two_evaluations_at_once_would_lose_flights_and_are_refused(parts, capsys):
     parts(a=part(True))
     Path("out/evaluation/quick").mkdir(parents=True)
