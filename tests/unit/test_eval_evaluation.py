@@ -89,6 +89,15 @@ def test_flights_that_parts_share_are_flown_once_and_again_when_asked_for(parts)
         assert command.main(arguments + ["--out", "results"]) == 0 and len(flown) == flights
 
 
+def test_flights_of_code_that_was_changed_meanwhile_are_not_stored_as_those_of_the_code_before(parts, monkeypatch, capsys):
+    flown, digests = [], iter(["0123456789ab", "0123456789ab", "ba9876543210"])
+    parts(a=flying(flown))
+    monkeypatch.setattr("perch_eval.revision.digest", lambda: next(digests))
+    assert command.main(["--out", "results"]) == 2 and "changed during the evaluation; start the evaluation again" in capsys.readouterr().err
+    kept_rows = Path("out/evaluation/quick/shared_0123456789ab.jsonl").read_text().splitlines()
+    assert len(flown) == 2 and len(kept_rows) == 1 and not Path("results/README.md").exists()
+
+
 def test_flights_of_unknown_code_are_not_reused(tmp_path):
     flown = []
     effort = Effort(True, 1, tmp_path, tmp_path, "", range(1), range(1), 1, {"commit": "unknown", "digest": ""})
@@ -105,6 +114,7 @@ def test_flights_that_could_not_be_carried_out_are_flown_again(tmp_path, monkeyp
             yield task, asdict(RunResult(task.run.number, 1, cause if task.run.number else "perched", "", ""))
 
     monkeypatch.setattr(kept, "in_processes", pool)
+    monkeypatch.setattr("perch_eval.revision.digest", lambda: "0123456789ab")
     effort = Effort(True, 1, tmp_path, tmp_path, "", range(1), range(1), 1, {"commit": "1234567", "digest": "0123456789ab"})
     tasks = [Task(Run(k, 1, {}), {}, "in_process", None) for k in range(2)]
     kept.cached_runs(effort, "flights", tasks)

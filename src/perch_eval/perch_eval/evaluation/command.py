@@ -14,6 +14,7 @@ from perch_core.registry import resolved
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Section
+from perch_eval.revision import OtherCodeError
 
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       both papers, 5 seeds a condition, 1 on lines
@@ -87,13 +88,19 @@ def _draft(folder: Path) -> Iterator[Path]:
 
 
 def evaluate(effort: Effort, names: list[str]) -> list[Section]:
-    """Return the sections of some parts; a part that raises an error becomes a row `not available`, and the others continue."""
+    """Return the sections of some parts; a part that raises an error becomes a row `not available`, and the others continue.
+
+    Raises:
+        OtherCodeError: the code was changed meanwhile.
+    """
     sections = []
     for k, name in enumerate(names):
         began = time.monotonic()
         print(f"[{k + 1}/{len(names)}] {name}", flush=True)
         try:
             part: list[Section] = resolved(f"perch_eval.evaluation.{PARTS[name]}")(effort)
+        except OtherCodeError:
+            raise
         except Exception as error:
             broken = Section(name, f"{name} could not be evaluated", "")
             broken.missing(name, "", f"{type(error).__name__}: {error}")
