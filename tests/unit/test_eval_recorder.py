@@ -215,6 +215,17 @@ def test_a_report_for_which_there_is_no_room_is_not_half_written_and_the_outcome
     assert "outcome: perched" in said.out and "cannot be written: No space left" in said.err and "Traceback" not in said.err
 
 
+@pytest.mark.parametrize("came_off, code, words", [(False, 0, "outcome: perched\n"), (True, 1, "outcome: perched (came_off: ")])
+def test_a_perch_is_one_by_the_truth_in_report_and_exit_code(tmp_path, monkeypatch, capsys, came_off, code, words):
+    flight = flown()
+    flight["contact"] += [(3.5, Contact(3_500_000_000, 0, "pad", 0.0, 0.0, 0.0, 0.0, ""))] * came_off
+    record(tmp_path / "flight.mcap", flight)
+    report = build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
+    monkeypatch.setattr(demo, "fly", lambda *_: report)
+    assert demo.main([]) == code and words in capsys.readouterr().out
+    assert ('class="bad"' in (tmp_path / "report.html").read_text()) == came_off and report["outcome"] == "perched"
+
+
 def test_a_flight_with_a_command_and_a_contact_that_are_unknown_has_a_report(tmp_path):
     contact = Contact(2 * NANOSECONDS, 9, "wall", 0.0, 0.0, 0.0, 0.0, "")
     record(tmp_path / "flight.mcap", flown() | {"controller/command": [(1.0, ControllerCommand(NANOSECONDS, 77, "by hand"))], "contact": [(2.0, contact)]})
