@@ -136,7 +136,7 @@ def outcome_text(report: dict[str, Any]) -> str:
 
 
 def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the results of a flight, (name, text), for the page and the terminal."""
+    """Return the results of a flight, (name, text), for the page and the terminal: of its perch, if one was planned."""
     rows = [("message", report["message"])]
     if f := report.get("inspection"):
         rows.append(("inspection", f"{f['collisions']} collisions ({f['reference_collisions']} of the reference); mean reprojection error "
@@ -150,13 +150,14 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
                                 f"{100 * contact['offset_m']:.1f} cm from the perch point {contact['reason']}".rstrip()))
     if report["recording_damage"]:
         rows.append(("recording", f"not read as a whole ({report['recording_damage']}): the figures are of what is read"))
+    part = "" if report.get("perch_planned", True) else ", of the whole recording"
     for kind in ("tracking", "estimation"):
         share = report.get(f"{kind}_judged", 1.0)
-        rows.append((f"{kind} RMSE x, y, z", _centimetres(report.get(f"{kind}_rmse_m")) +
+        rows.append((f"{kind} RMSE x, y, z{part}", _centimetres(report.get(f"{kind}_rmse_m")) +
                      (f" (available in {100 * share:.0f} % of the time)" if share < 0.99 else "")))
     return [*rows,
-            ("largest body rate", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
-            ("largest acceleration", f"{report.get('max_acceleration_m_s2', math.nan):.1f} m/s^2"),
+            (f"largest body rate{part}", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
+            (f"largest acceleration{part}", f"{report.get('max_acceleration_m_s2', math.nan):.1f} m/s^2"),
             ("real-time factor", f"{report['real_time_factor']:.2f}: {report['simulated_duration_s']:.2f} s of simulated time "
                                  f"in {report['wall_time_s']:.2f} s"),
             ("ended at", f"{report['simulated_time_s']:.2f} s of simulated time"), ("flight hash", report["flight_hash"][:16])]
