@@ -140,7 +140,7 @@ def test_only_an_evaluation_of_everything_replaces_the_committed_page_by_default
     assert {str(page) for page in Path().rglob("README.md")} == {f"{folder}/README.md"}
 
 
-def test_an_interrupted_evaluation_leaves_pages_and_figures_as_they_were(parts):
+def test_an_interrupted_evaluation_leaves_pages_and_figures_as_they_were(parts, capsys):
     def drawing(effort):
         (effort.out / "figure.png").write_text("new")
         if interrupts:
@@ -154,6 +154,7 @@ def test_an_interrupted_evaluation_leaves_pages_and_figures_as_they_were(parts):
     for interrupts, code, content in ((True, 130, ["old", "old", "old"]), (False, 0, ["new", "# Res", "old"])):
         assert command.main(["--out", "results"]) == code
         assert [Path("results", name).read_text()[:5] for name in ("figure.png", "README.md", "notes.txt")] == content
+    assert "finished flights are kept, except those of c_consistency" in capsys.readouterr().err
     assert {file.name for file in Path("results").iterdir()} == {"figure.png", "README.md", "notes.txt", "results.json"}
 
 
