@@ -42,7 +42,8 @@ OBSERVATION_TIME = 6.0                    # after they have stopped [s]
 class Stop:
     """Result of stopped commands; times are from the last command [s].
 
-    inf: never; nan: not before the next command or a touch, or with the motors off before, which leaves it open.
+    inf: never; nan: not before the next command or a touch, or with the motors off before, which leaves it open. A vehicle that
+    touches something before it is level was not levelled in time: inf.
 
     Attributes:
         tilt: of the body at the last command [deg].
@@ -110,12 +111,17 @@ def stopped(at: float, gap: float | None, kill: bool = False) -> Stop:
     def first(which: set[Mode]) -> float:
         return next((float(time) for time, mode in zip(t, modes) if mode in which), missing)
 
-    above = np.flatnonzero(tilt > LEVEL)
-    after = 0 if above.size == 0 else above[-1] + 1
     followed = [float(time) for time, mode in zip(t, modes) if mode is Mode.FOLLOWING]
     return Stop(tilt[0], tilt.max(), first({Mode.LEVEL, Mode.DESCENDING, Mode.DISARMED}),
-                np.nan if not flying else float(t[after]) if after < len(t) else missing, first({Mode.DESCENDING, Mode.DISARMED}),
+                level_from(t, tilt) if flying else np.nan, first({Mode.DESCENDING, Mode.DISARMED}),
                 max(followed, default=0.0))
+
+
+def level_from(t: np.ndarray, tilt: np.ndarray) -> float:
+    """Return the time from which on the body is level; inf: it is not at the end. `tilt` [deg] at times t [s], shapes (n,)."""
+    above = np.flatnonzero(tilt > LEVEL)
+    after = 0 if above.size == 0 else above[-1] + 1
+    return float(t[after]) if after < len(t) else np.inf
 
 
 def levelled(vehicle: str, axis: tuple[float, float, float], tilt: float, rate: float) -> float:
@@ -170,7 +176,7 @@ def figures(quick: bool) -> list[Figure]:
     flying = {key: one for key, one in found.items() if key[0] != "perched"}
     out.append(figure("last command held", "s", [one.held for one in flying.values()], 0.05, "max <="))
     long = [one for (_, gap, _), one in flying.items() if gap is None or gap > 0.3]
-    out.append(figure(f"level within {LEVEL:g} deg", "s", [one.levelled for one in long if not np.isnan(one.levelled)], 0.3, "max <="))
+    out.append(figure(f"level within {LEVEL:g} deg", "s", [one.levelled for one in long], 0.3, "max <="))
     for tilt, rate in TILTED:
         times = [levelled(vehicle, axis, tilt, rate)
                  for vehicle in (SCENARIO.vehicle, "rpg_betaflight") for axis in (AXES[1:2] if quick else AXES)]

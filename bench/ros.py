@@ -21,9 +21,9 @@ from perch_core.ros.topics import stamp_of, topic
 from perch_core.trajectory import rest_to_rest
 from perch_core.values import ControllerCommand as Command
 from perch_core.values import TrajectoryOrder, nanoseconds, seconds
+from perch_eval.campaign.causes import SUCCESS
 from perch_eval.demo import fly
 from perch_eval.domain import domain_in_environment
-from perch_eval.goal import SUCCESSES
 from perch_eval.nodes import ALL_NODES, CHAIN_NODES, programs
 from perch_eval.ros.graph_node import GraphNode
 from perch_eval.stack import Stack
@@ -192,7 +192,7 @@ def figures(quick: bool) -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix="perch-bench-") as name:
         folder = Path(name)
         flights = [fly("surface_90", seed, folder / f"flight_{seed}") for seed in range(1, 2 if quick else 4)]
-        factors = [flight["real_time_factor"] if flight["outcome"] in SUCCESSES else np.nan for flight in flights]
+        factors = [flight["real_time_factor"] if flight["cause"] == SUCCESS else np.nan for flight in flights]
         return [figure("whole stack, both cameras, lockstep, flights that perch", "x real time", factors, bar=0.7, comparison="median >="),
                 lockstep(scenario, folder / "processes", windows, composed=()),
                 lockstep(scenario, folder / "composed", windows, composed=ALL_NODES),

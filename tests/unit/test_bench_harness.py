@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -34,6 +35,23 @@ def test_malformed_figures_are_refused():
         harness.figure("a", "ms", [])
     with pytest.raises(ValueError, match="comparison"):
         harness.figure("a", "ms", [1.0], bar=1.0, comparison="mean <")
+
+
+def test_a_powerline_perch_without_recovery_is_not_solved(monkeypatch):
+    from perch_core.errors import PlanningRefusal
+
+    monkeypatch.setitem(sys.modules, "powerline_ipopt", SimpleNamespace())
+    powerline = importlib.import_module("powerline")
+    part = SimpleNamespace(cpu_time=0.01, solve_time=0.01, iterations=9, bounds=())
+    plans = [SimpleNamespace(perch=part, recovery=recovery, bounds=(), without_recovery="no room") for recovery in (part, None)]
+    answers = [powerline._answer(SimpleNamespace(plan=lambda _, plan=plan: plan), None) for plan in plans]
+
+    def refuse(_):
+        raise PlanningRefusal("solver", "perch", -1.0, "none")
+
+    answers.append(powerline._answer(SimpleNamespace(plan=refuse), None))
+    assert [bool(answer["missing"]) for answer in answers] == [False, True, True] and answers[1]["missing"] == "no recovery: no room"
+    assert [bool(answer["refusal"]) for answer in answers] == [False, False, True]  # starts anywhere: perches alone
 
 
 def test_measure_counts_only_after_the_warm_up():
@@ -117,9 +135,9 @@ def test_a_campaign_refuses_what_it_cannot_work_with(campaign, capsys, words):
 # -- the machine -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("gap, touch, missing", [(None, False, math.inf), (10.0, False, math.inf), (0.5, False, math.nan), (None, True, math.nan)])
-def test_a_vehicle_that_never_levels_fails_the_bar(monkeypatch, gap, touch, missing):
-    """Unless the commands went on, or a touch ended it, before it could."""
+@pytest.mark.parametrize("gap, touch, down", [(None, False, math.inf), (10.0, False, math.inf), (0.5, False, math.nan), (None, True, math.nan)])
+def test_a_vehicle_that_is_not_level_when_commands_go_on_or_it_touches_the_wall_fails_the_bar(monkeypatch, gap, touch, down):
+    """The descent, which begins later, is left open then."""
     autopilot = importlib.import_module("autopilot")
     touched, tilted = [], np.array([0.5, 0.0, 0.0, 0.866])
     body = SimpleNamespace(plant=SimpleNamespace(rotor_speed=np.ones(4)), state=SimpleNamespace(q_WB=tilted))
@@ -130,16 +148,16 @@ def test_a_vehicle_that_never_levels_fails_the_bar(monkeypatch, gap, touch, miss
         touched.extend([loop.time] if touch and loop.time > 2.0 else [])
 
     loop.step = step
+    assert autopilot.level_from(np.array([0.0, 0.1, 0.2]), np.array([40.0, 5.0, 3.0])) == 0.1
     link = SimpleNamespace(kill=lambda: None, last_command=1.0, watchdog=SimpleNamespace(mode=autopilot.Mode.FOLLOWING))
     monkeypatch.setattr(autopilot, "start_flight", lambda: (loop, link, touched))
     found = autopilot.stopped(1.0, gap)
-    assert found.levelled == found.down == missing or math.isnan(found.levelled) and math.isnan(missing)
-    for name, value in (("stopped", lambda *_: found), ("phase_times", lambda: {"hover": 1.0}), ("levelled", lambda *_: 0.1),
+    assert found.levelled == math.inf and (found.down == down or math.isnan(found.down) and math.isnan(down))
+    for name, value in (("stopped", lambda *_: replace(found, down=math.inf)), ("phase_times", lambda: {"hover": 1.0}), ("levelled", lambda *_: 0.1),
                         ("held_without_link", lambda: 0.01), ("taken_over", lambda _: 0.01)):
         monkeypatch.setattr(autopilot, name, value)
-    if missing == math.inf:
-        judged = {one.name: one.holds for one in autopilot.figures(True)}
-        assert judged["level within 10 deg"] is judged["descent or motors off"] is False
+    judged = {one.name: one.holds for one in autopilot.figures(True)}
+    assert judged["level within 10 deg"] is judged["descent or motors off"] is False
 
 
 def test_a_flight_that_never_perches_is_an_error_and_not_endless(monkeypatch):

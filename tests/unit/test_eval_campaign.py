@@ -2,11 +2,13 @@
 
 import json
 import math
+import sys
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -26,6 +28,7 @@ from perch_eval.campaign.figures import Axis
 from perch_eval.campaign.results import Results, ResultsError, RunResult, read_results, worst
 from perch_eval.campaign.specification import Run, load_campaign
 from perch_eval.evaluation import command as evaluation
+from perch_eval.revision import OtherCodeError
 from perch_eval.statistics import Rate, Spread
 from perch_sim.contact_event import ContactState
 from perch_sim.scenario import Scenario
@@ -54,6 +57,25 @@ def test_draws_follow_their_distributions():
 def test_a_distribution_that_says_nothing_is_refused(entry):
     with pytest.raises(ConfigError, match="vary.a"):
         parse("c.yaml", "vary.a", entry)
+
+
+def test_a_worker_of_a_cluster_with_other_code_ends_the_campaign(monkeypatch):
+    code = iter(["campaign's", "campaign's", "worker's"])
+    for module in ("perch_eval.revision", "perch_eval.campaign.workers"):
+        monkeypatch.setattr(f"{module}.digest", lambda: next(code))
+    monkeypatch.setattr(workers, "require", lambda extra: None)
+    monkeypatch.setattr(workers, "run_task", lambda task: task.run.number)
+
+    def submit(work, *arguments, **_):
+        future = ThreadPoolExecutor(1).submit(work, *arguments)
+        future.release = lambda: None
+        return future
+
+    cluster = SimpleNamespace(Client=lambda *_, **__: MagicMock(submit=submit), as_completed=list)
+    monkeypatch.setitem(sys.modules, "distributed", cluster)
+    results = workers.on_cluster([Task(Run(number, 1, {}), {}, "in_process", None) for number in (1, 2)], "tcp://host:8786")
+    with pytest.raises(OtherCodeError, match="other code than the campaign"):
+        list(results)
 
 
 def test_files_that_a_campaign_names_are_found_beside_it(tmp_path, monkeypatch):

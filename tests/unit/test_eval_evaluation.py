@@ -89,6 +89,15 @@ def test_flights_that_parts_share_are_flown_once_and_again_when_asked_for(parts)
         assert command.main(arguments + ["--out", "results"]) == 0 and len(flown) == flights
 
 
+def test_flights_of_code_that_was_changed_meanwhile_are_not_stored_as_those_of_the_code_before(parts, monkeypatch, capsys):
+    flown, digests = [], iter(["0123456789ab", "0123456789ab", "ba9876543210"])
+    parts(a=flying(flown))
+    monkeypatch.setattr("perch_eval.revision.digest", lambda: next(digests))
+    assert command.main(["--out", "results"]) == 2 and "changed during the evaluation; start the evaluation again" in capsys.readouterr().err
+    kept_rows = Path("out/evaluation/quick/shared_0123456789ab.jsonl").read_text().splitlines()
+    assert len(flown) == 2 and len(kept_rows) == 1 and not Path("results/README.md").exists()
+
+
 def test_flights_of_unknown_code_are_not_reused(tmp_path):
     flown = []
     effort = Effort(True, 1, tmp_path, tmp_path, "", range(1), range(1), 1, {"commit": "unknown", "digest": ""})
@@ -105,6 +114,7 @@ def test_flights_that_could_not_be_carried_out_are_flown_again(tmp_path, monkeyp
             yield task, asdict(RunResult(task.run.number, 1, cause if task.run.number else "perched", "", ""))
 
     monkeypatch.setattr(kept, "in_processes", pool)
+    monkeypatch.setattr("perch_eval.revision.digest", lambda: "0123456789ab")
     effort = Effort(True, 1, tmp_path, tmp_path, "", range(1), range(1), 1, {"commit": "1234567", "digest": "0123456789ab"})
     tasks = [Task(Run(k, 1, {}), {}, "in_process", None) for k in range(2)]
     kept.cached_runs(effort, "flights", tasks)
@@ -121,6 +131,31 @@ def test_a_page_is_of_the_code_with_which_its_flights_began(parts, monkeypatch):
     assert command.main(["--out", "results"]) == 0
     assert "> **Of commit 1234567, older than the code**" in Path("results/README.md").read_text()
     assert json.loads(Path("results/results.json").read_text())["digest"] == "0123456789ab"
+
+
+@pytest.mark.parametrize("arguments, folder", [([], "out/results"), (["--full", "--only", "a"], "out/results"), (["--full"], "docs/results")])
+def test_only_an_evaluation_of_everything_replaces_the_committed_page_by_default(parts, arguments, folder):
+    parts(a=part(True), b=part(True))
+    assert command.main(arguments) == 0
+    assert {str(page) for page in Path().rglob("README.md")} == {f"{folder}/README.md"}
+
+
+def test_an_interrupted_evaluation_leaves_pages_and_figures_as_they_were(parts, capsys):
+    def drawing(effort):
+        (effort.out / "figure.png").write_text("new")
+        if interrupts:
+            raise KeyboardInterrupt
+        return part(True)(effort)
+
+    parts(a=drawing)
+    Path("results").mkdir()
+    for name in ("figure.png", "README.md", "notes.txt"):
+        Path("results", name).write_text("old")
+    for interrupts, code, content in ((True, 130, ["old", "old", "old"]), (False, 0, ["new", "# Res", "old"])):
+        assert command.main(["--out", "results"]) == code
+        assert [Path("results", name).read_text()[:5] for name in ("figure.png", "README.md", "notes.txt")] == content
+    assert "finished flights are kept, except those of c_consistency" in capsys.readouterr().err
+    assert {file.name for file in Path("results").iterdir()} == {"figure.png", "README.md", "notes.txt", "results.json"}
 
 
 def test_two_evaluations_at_once_would_lose_flights_and_are_refused(parts, capsys):

@@ -16,7 +16,7 @@ from perch_core.trajectory import rest_to_rest
 from perch_eval.flight import Flight, timed
 from perch_eval.mcap_log import read
 from perch_eval import demo
-from perch_eval.report import build_report
+from perch_eval.report import build_report, summary
 from perch_eval.ros.recorded_flight import RecordedFlight, write
 from perch_eval.ros.recorder import CHANNELS, Recorder, RecorderParameters
 from perch_core.component import Diagnostics, Input, ports
@@ -213,6 +213,27 @@ def test_a_report_for_which_there_is_no_room_is_not_half_written_and_the_outcome
     assert demo.main([]) == 2
     said = capsys.readouterr()
     assert "outcome: perched" in said.out and "cannot be written: No space left" in said.err and "Traceback" not in said.err
+
+
+@pytest.mark.parametrize("came_off, code, words", [(False, 0, "outcome: perched\n"), (True, 1, "outcome: perched (came_off: ")])
+def test_a_perch_is_one_by_the_truth_in_report_and_exit_code(tmp_path, monkeypatch, capsys, came_off, code, words):
+    flight = flown()
+    flight["contact"] += [(3.5, Contact(3_500_000_000, 0, "pad", 0.0, 0.0, 0.0, 0.0, ""))] * came_off
+    record(tmp_path / "flight.mcap", flight)
+    report = build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
+    monkeypatch.setattr(demo, "fly", lambda *_: report)
+    assert demo.main([]) == code and words in capsys.readouterr().out
+    assert ('class="bad"' in (tmp_path / "report.html").read_text()) == came_off and report["outcome"] == "perched"
+
+
+@pytest.mark.parametrize("perch, part", [(True, ""), (False, ", of the whole recording")])
+def test_figures_of_a_flight_without_a_planned_perch_are_named_as_those_of_the_whole_recording(tmp_path, perch, part):
+    flight = flown()
+    if not perch:
+        del flight["trajectory"]
+    record(tmp_path / "flight.mcap", flight)
+    names = dict(summary(build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)))
+    assert {f"{one}{part}" for one in ("tracking RMSE x, y, z", "estimation RMSE x, y, z", "largest body rate", "largest acceleration")} <= set(names)
 
 
 def test_a_flight_with_a_command_and_a_contact_that_are_unknown_has_a_report(tmp_path):

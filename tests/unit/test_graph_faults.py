@@ -20,8 +20,10 @@ from perch_eval.graph_faults import campaign
 from perch_eval.graph_faults.cases import (
     FAULTS, LOCKSTEP, MODES, NODE_PATTERNS, NODES, PHASES, PROCESS, REAL_TIME, SAFE, Case, Situation, cases, ending, first_report)
 from perch_eval.graph_faults.flight import UNANSWERED, _FaultInjector
+from perch_eval.graph_faults.group import Group
 from perch_eval.graph_faults.relay_node import DELAY, Disturbance
 from perch_eval.fork_server import alive, session, start
+from perch_sim.contact import CRASH_SPEED
 
 CASE = Case("kill", "estimator", "climb", LOCKSTEP)
 CODE = {"commit": "1234567", "digest": "now"}
@@ -100,6 +102,22 @@ def test_what_is_not_as_it_should_be_is_said(changes, problem):
     assert all(word in campaign.page([row(**changes)]) for word in problem)
 
 
+def test_a_vehicle_that_hits_the_floor_faster_than_it_survives_has_crashed_also_in_rows_of_earlier_flights(tmp_path):
+    file = tmp_path / campaign.ROWS
+    file.write_text("".join(json.dumps(row(node=node, end=end, impact=impact)) + "\n" for node, end, impact in (
+        ("controller", "landed", CRASH_SPEED + 0.01), ("mission", "motors off", CRASH_SPEED + 2.0), ("estimator", "landed", CRASH_SPEED))))
+    ends = {case.node: one["end"] for case, one in campaign.load(file).items()}
+    assert ends == {"controller": "crashed", "mission": "crashed", "estimator": "landed"} and "crashed" not in SAFE
+    page = campaign.page(list(campaign.load(file).values()))
+    assert "**1 of 3 end safely**" in page and page.count("ended crashed") == 2
+
+
+def test_shares_of_named_faults_are_of_all_faults_whatever_became_of_the_flight():
+    page = campaign.page([row(), row(named=None), row(fault="drop", goal="perched: perched", named=None), row(fault="drop", named=1.0)])
+    assert "**1 of 2 faults of processes are named within 5 s**" in page and " 1 of 2 disturbances of messages" in page
+    assert " 1 disturbances that are not named had no effect" in page
+
+
 def test_a_killed_campaign_keeps_what_was_flown(tmp_path, monkeypatch):
     file = tmp_path / campaign.ROWS
     file.write_text(json.dumps(row()) + "\n" + json.dumps(row(node="mission"))[:50])
@@ -163,6 +181,18 @@ def test_a_goal_whose_mission_is_gone_is_followed_until_the_fault_has_had_its_ti
         injector.injection_wall_time = 1000.0 - after
         with nullcontext() if followed else pytest.raises(PerchError, match=UNANSWERED):
             injector.check_goal()
+
+
+def test_a_process_that_has_to_be_killed_at_the_end_is_residue(monkeypatch):
+    monkeypatch.setattr("perch_eval.graph_faults.group.STOP_TIMEOUTS", (1.0, 60.0))
+    ends, ignores = (subprocess.Popen([sys.executable, "-c", f"import signal, time; signal.signal(signal.SIGINT, signal.{handler}); "
+                                       "print(flush=True); time.sleep(300)"], stdout=subprocess.PIPE) for handler in ("SIG_DFL", "SIG_IGN"))
+    ends.stdout.readline(), ignores.stdout.readline()
+    group = Group((), CASE, Path(), 43)
+    group.pids = {"mission": ends.pid, "controller": ignores.pid}
+    group.stop()
+    assert (ends.wait(), ignores.wait()) == (-signal.SIGINT, -signal.SIGKILL)
+    assert group.leftovers() == ("process controller after SIGINT",)
 
 
 def test_processes_of_a_fork_server_are_their_own(tmp_path, monkeypatch):

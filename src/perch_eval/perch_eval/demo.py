@@ -16,9 +16,9 @@ from perch_core.errors import ConfigError, PerchError
 from perch_core.jit import uncompiled
 from perch_core.vehicle import load_vehicle
 from perch_eval.arguments import command, command_parser, locked_folder, open_network
+from perch_eval.campaign.causes import SUCCESS
 from perch_eval.domain import domain_in_environment
 from perch_eval.flyable import check_flight
-from perch_eval.goal import SUCCESSES
 from perch_eval.nodes import CHAIN_NODES, FAST_NODES, programs, sharing
 from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_eval.stack import Stack, StackError
@@ -129,14 +129,14 @@ def _demonstrate(args: argparse.Namespace) -> int:
     # Real time has deadlines at 500 Hz that the work of more neighbours in the same process would miss.
     composed = sharing(args.composed, otherwise=() if args.separate else CHAIN_NODES if args.realtime else FAST_NODES)
     report = fly(args.scenario, args.seed, args.out, composed, args.realtime, args.verbose, args.vehicle)
-    from perch_eval.report import summary
-    print(f"outcome: {report['outcome']}")
+    from perch_eval.report import outcome_text, summary
+    print(f"outcome: {outcome_text(report)}")
     print("".join(f"  {name}: {text}\n" for name, text in summary(report)), end="")
     if "unwritten" in report:
         print(f"error: {report['unwritten']}", file=sys.stderr)
         return 2
     print(f"report: {args.out / 'report.html'}")
-    return 0 if report["outcome"] in SUCCESSES else 1
+    return 0 if report["cause"] == SUCCESS else 1
 
 
 main = command(parser, _demonstrate, interrupted="interrupted; all nodes are stopped")

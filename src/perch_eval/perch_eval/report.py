@@ -16,6 +16,7 @@ from perch_core.values import Command
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval import plots
 from perch_eval.camera_clip import clip
+from perch_eval.campaign.causes import MEANING, SUCCESS, cause_of
 from perch_eval.evaluation.document import machine
 from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
@@ -24,7 +25,6 @@ from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import InspectionResult, recorded_inspection
 from perch_eval.margins import margin_text, margins
 from perch_eval.metrics import DURATION, diagnostics, flight_metrics, missed_deadlines, node_durations, rates
-from perch_eval.goal import SUCCESSES
 from perch_eval.page import Html, image, page, section, table, text
 from perch_eval.revision import code_version, command_line
 from perch_eval.ros.recorded_flight import RecordedFlight
@@ -55,7 +55,8 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         first = flight.values("ground_truth/odometry")
         start_time = first[0][0] if first else end_time
     report: dict[str, Any] = {
-        "outcome": outcome, "message": message, "scenario": scenario.name, "vehicle": scenario.vehicle, "seed": seed,
+        "outcome": outcome, "cause": cause_of(outcome, [contact for _, contact in flight.values("contact")], scenario),
+        "message": message, "scenario": scenario.name, "vehicle": scenario.vehicle, "seed": seed,
         "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", **code_version(), "command": command_line(), "machine": machine(),
         "simulated_time_s": end_time, "simulated_duration_s": end_time - start_time, "wall_time_s": wall_time,
         "real_time_factor": (end_time - start_time) / wall_time if wall_time > 0 else math.nan,
@@ -128,8 +129,14 @@ def _centimetres(values: Any) -> str:
     return ", ".join("-" if v is None or not math.isfinite(v) else f"{100 * v:.1f}" for v in values) + " cm"
 
 
+def outcome_text(report: dict[str, Any]) -> str:
+    """Return the mission's outcome in words, with the cause of failure, as in campaigns: a success is one by the truth, too."""
+    outcome, cause = report["outcome"], report["cause"]
+    return outcome if cause == SUCCESS else f"{outcome} ({cause}: {MEANING[cause]})"
+
+
 def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the results of a flight, (name, text), for the page and the terminal."""
+    """Return the results of a flight, (name, text), for the page and the terminal: of its perch, if one was planned."""
     rows = [("message", report["message"])]
     if f := report.get("inspection"):
         rows.append(("inspection", f"{f['collisions']} collisions ({f['reference_collisions']} of the reference); mean reprojection error "
@@ -143,13 +150,14 @@ def summary(report: dict[str, Any]) -> list[tuple[str, str]]:
                                 f"{100 * contact['offset_m']:.1f} cm from the perch point {contact['reason']}".rstrip()))
     if report["recording_damage"]:
         rows.append(("recording", f"not read as a whole ({report['recording_damage']}): the figures are of what is read"))
+    part = "" if report.get("perch_planned", True) else ", of the whole recording"
     for kind in ("tracking", "estimation"):
         share = report.get(f"{kind}_judged", 1.0)
-        rows.append((f"{kind} RMSE x, y, z", _centimetres(report.get(f"{kind}_rmse_m")) +
+        rows.append((f"{kind} RMSE x, y, z{part}", _centimetres(report.get(f"{kind}_rmse_m")) +
                      (f" (available in {100 * share:.0f} % of the time)" if share < 0.99 else "")))
     return [*rows,
-            ("largest body rate", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
-            ("largest acceleration", f"{report.get('max_acceleration_m_s2', math.nan):.1f} m/s^2"),
+            (f"largest body rate{part}", f"{report.get('max_body_rate_deg_s', math.nan):.0f} deg/s"),
+            (f"largest acceleration{part}", f"{report.get('max_acceleration_m_s2', math.nan):.1f} m/s^2"),
             ("real-time factor", f"{report['real_time_factor']:.2f}: {report['simulated_duration_s']:.2f} s of simulated time "
                                  f"in {report['wall_time_s']:.2f} s"),
             ("ended at", f"{report['simulated_time_s']:.2f} s of simulated time"), ("flight hash", report["flight_hash"][:16])]
@@ -175,7 +183,7 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
     view = None
     with suppress(PerchError):
         view = FlightView.from_flight(flight, vehicle, scenario.name, until=report["simulated_time_s"])
-    good = "good" if report["outcome"] in SUCCESSES else "bad"
+    good = "good" if report["cause"] == SUCCESS else "bad"
     timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
                for node, values in report["timings_ms"].items()]
     margin_rows = [(m["name"], margin_text(m)) for m in report["margins"]]
@@ -191,4 +199,4 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
         *(section(name, image(figure, name)) for name, figure in _figures(view, inspection)),
         section("Rates", table((topic, f"{rate:.1f} Hz") for topic, rate in report["rates_hz"].items())),
         section("Times that the nodes measured", table(timings)), section("Diagnostics of the last second", table(last_diagnostics(flight))),
-        heading=Html(f'{text(title)}: <span class="{good}">{text(report["outcome"])}</span>'))
+        heading=Html(f'{text(title)}: <span class="{good}">{text(outcome_text(report))}</span>'))

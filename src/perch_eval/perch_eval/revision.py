@@ -15,11 +15,16 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from perch_core.config import config_dir
+from perch_core.errors import PerchError
 
 CODE = ("src", "config", "requirements")
 OLDER = ", older than the code"
 _DIGEST = re.compile(r"\(digest ([0-9a-f]{12})\)")
 _DOCSTRING = re.compile(rb'^([ \t]*)"""(?![),])(?:[^"\\]|\\.|"(?!""))*"""[ \t]*$', re.MULTILINE | re.DOTALL)
+
+
+class OtherCodeError(PerchError):
+    """The code that runs is not that of the results."""
 
 
 def root() -> Path:
@@ -76,6 +81,16 @@ def digest() -> str:
         content = path.read_bytes() if path.is_file() else b""
         total.update(name.encode() + b"\0" + (without_docstrings(content) if path.suffix == ".py" else content) + b"\0")
     return total.hexdigest()[:12] if names else ""
+
+
+def require_code(expected: str, remedy: str) -> None:
+    """Check that the code has a digest; an empty one is unknown and is not compared.
+
+    Raises:
+        OtherCodeError: it has another one.
+    """
+    if expected and (now := digest()) != expected:
+        raise OtherCodeError(f"the code has digest {now}, its results would be stored under {expected}: {remedy}")
 
 
 def code_version() -> dict[str, str]:

@@ -27,7 +27,7 @@ from perch_eval.campaign.specification import Campaign, Run
 from perch_eval.flight import Flight
 from perch_eval.in_process import Sensing, fly
 from perch_eval.metrics import figures, flight_metrics
-from perch_sim.scenario import Scenario, load_scenario
+from perch_sim.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -118,20 +118,17 @@ def fly_on_the_stack(task: Task) -> RunResult:
     """Fly one run on the real nodes: composed, in lockstep, in a separate ROS domain."""
     from perch_eval.demo import fly
     from perch_eval.nodes import ALL_NODES
-    from perch_eval.ros.recorded_flight import RecordedFlight
 
     with contextlib.ExitStack() as stack:
         folder = Path(task.report_folder or stack.enter_context(tempfile.TemporaryDirectory(prefix="perch-run-")))
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / "scenario.yaml"
         file.write_text(yaml.safe_dump(task.scenario))
-        scenario = load_scenario(file)
         log = stack.enter_context(open(folder / "flight.log", "w"))
         with contextlib.redirect_stdout(log):
             report = fly(str(file), task.run.seed, folder, composed=ALL_NODES)
-        contacts = [contact for _, contact in RecordedFlight(folder / "flight.mcap").values("contact")]
-    return RunResult(task.run.number, task.run.seed, cause_of(report["outcome"], contacts, scenario), report["outcome"],
-                     report["message"], metrics=figures(report, report["simulated_time_s"]))
+    return RunResult(task.run.number, task.run.seed, report["cause"], report["outcome"], report["message"],
+                     metrics=figures(report, report["simulated_time_s"]))
 
 
 ENGINES: dict[str, Callable[[Task], RunResult]] = {"in_process": fly_in_process, "stack": fly_on_the_stack}

@@ -19,6 +19,7 @@ from perch_eval.campaign.causes import ERROR
 from perch_eval.campaign.engines import Task, run_task
 from perch_eval.campaign.results import RunResult
 from perch_eval.extras import require
+from perch_eval.revision import OtherCodeError, digest, require_code
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -123,6 +124,12 @@ def in_pool(tasks: Sequence[Task], jobs: int) -> Iterator[RunResult]:
         yield result
 
 
+def _run_with_code(code: str, task: Task) -> RunResult:
+    """Carry out a run on a worker, which must have the code of the campaign."""
+    require_code(code, "a worker of the cluster has other code than the campaign; update it, and continue with --resume")
+    return run_task(task)
+
+
 def on_cluster(tasks: Sequence[Task], address: str) -> Iterator[RunResult]:
     """Carry out tasks on a Dask cluster, which repeats the unfinished tasks of a lost worker.
 
@@ -132,6 +139,7 @@ def on_cluster(tasks: Sequence[Task], address: str) -> Iterator[RunResult]:
 
     Raises:
         PerchError: the scheduler does not answer.
+        OtherCodeError: a worker has other code than this process.
     """
     require("campaigns")
     from distributed import Client, as_completed
@@ -141,12 +149,15 @@ def on_cluster(tasks: Sequence[Task], address: str) -> Iterator[RunResult]:
     except (OSError, TimeoutError, ValueError) as error:
         raise PerchError(f"--cluster {address}: {error or 'no answer from the scheduler'}") from None
     with client:
-        futures = {client.submit(run_task, task, key=f"run-{task.run.number}-{id(tasks):x}", pure=False, retries=ATTEMPTS):
+        code = digest()
+        futures = {client.submit(_run_with_code, code, task, key=f"run-{task.run.number}-{id(tasks):x}", pure=False, retries=ATTEMPTS):
                    task for task in tasks}
         for future in as_completed(list(futures)):
             task = futures.pop(future)
             try:
                 result = future.result()  # may be lost with its worker even now: Dask then carries it out again
+            except OtherCodeError:
+                raise
             except Exception as error:
                 result = failed_run(task, f"{type(error).__name__}: {error}")
             future.release()

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import argparse
 import os
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from perch_core.registry import resolved
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.evaluation import document
 from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Section
+from perch_eval.revision import OtherCodeError
 
 EXAMPLES = """examples:
   python3 scripts/evaluate.py                       both papers, 5 seeds a condition, 1 on lines
@@ -42,9 +46,10 @@ def parser() -> argparse.ArgumentParser:
     out = command_parser("evaluate.py", __doc__, EXAMPLES)
     size = out.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="both papers, with few flights (default)")
-    size.add_argument("--full", action="store_true", help="every part, with many flights; resumable")
+    size.add_argument("--full", action="store_true", help="every part, with many flights; resumable, but for c_consistency")
     out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
-    out.add_argument("--out", type=Path, default=Path("docs/results"), metavar="DIR", help="folder of page, figures and JSON (default: %(default)s)")
+    out.add_argument("--out", type=Path, metavar="DIR", help="folder of page, figures and JSON, replaced at the end (default: docs/results with --full and "
+                                                              "without --only, otherwise out/results)")
     out.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"{', '.join(PARTS)}; may be repeated")
     for name, (what, quick, full) in FLIGHTS.items():
         out.add_argument(f"--{name}", type=count, metavar="N", help=f"{what} (default: {quick}, with --full {full})")
@@ -53,31 +58,49 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _regenerate(args: argparse.Namespace) -> int:
-    mode = "full" if args.full else "quick"
+    # The page in docs/results is of all parts: fewer do not replace it by default.
+    folder = args.out or (Path("docs/results") if args.full and not args.only else Path("out/results"))
+    state = Path("out") / "evaluation" / ("full" if args.full else "quick")
     counts = {name: getattr(args, name.replace("-", "_")) or (full if args.full else quick) for name, (_, quick, full) in FLIGHTS.items()}
     made_by = ["python3 scripts/evaluate.py", *["--full"] * args.full, *(f"--{name} {n}" for name, n in counts.items()),
-               *(f"--only {name}" for name in args.only or ()), f"--out {args.out}"]
-    effort = Effort(args.full, args.jobs, args.out, Path("out") / "evaluation" / mode, " ".join(made_by),
-                    range(1, 1 + counts["seeds"]), range(1, 1 + counts["line-seeds"]), counts["layouts"])
+               *(f"--only {name}" for name in args.only or ()), f"--out {folder}"]
     began = time.monotonic()
-    output_folder(args.out), output_folder(effort.state, "finished flights")
-    for kept in effort.state.glob("*.jsonl") if args.fresh else ():
+    output_folder(folder), output_folder(state, "finished flights")
+    for kept in state.glob("*.jsonl") if args.fresh else ():
         kept.unlink()
-    sections = evaluate(effort, [name for name in PARTS if (name in args.only if args.only else args.full or name not in BEYOND_PAPERS)])
-    document.write(sections, effort, time.monotonic() - began)
+    with _draft(folder) as draft:
+        effort = Effort(args.full, args.jobs, draft, state, " ".join(made_by), range(1, 1 + counts["seeds"]),
+                        range(1, 1 + counts["line-seeds"]), counts["layouts"])
+        sections = evaluate(effort, [name for name in PARTS if (name in args.only if args.only else args.full or name not in BEYOND_PAPERS)])
+        document.write(sections, effort, time.monotonic() - began)
     found = document.counts(sections)
-    print(f"results: {args.out / 'README.md'}: " + ", ".join(f"{n} {verdict}" for verdict, n in found.items()))
+    print(f"results: {folder / 'README.md'}: " + ", ".join(f"{n} {verdict}" for verdict, n in found.items()))
     return 1 if found.get(FAILS) else 3 if found.get(MISSING) else 0
 
 
+@contextmanager
+def _draft(folder: Path) -> Iterator[Path]:
+    """Yield a folder whose files replace those of `folder` at the end; after an error or Ctrl-C, `folder` is as before."""
+    with tempfile.TemporaryDirectory(prefix=".draft-", dir=folder) as draft:
+        yield Path(draft)
+        for file in Path(draft).iterdir():
+            file.replace(folder / file.name)
+
+
 def evaluate(effort: Effort, names: list[str]) -> list[Section]:
-    """Return the sections of some parts; a part that raises an error becomes a row `not available`, and the others continue."""
+    """Return the sections of some parts; a part that raises an error becomes a row `not available`, and the others continue.
+
+    Raises:
+        OtherCodeError: the code was changed meanwhile.
+    """
     sections = []
     for k, name in enumerate(names):
         began = time.monotonic()
         print(f"[{k + 1}/{len(names)}] {name}", flush=True)
         try:
             part: list[Section] = resolved(f"perch_eval.evaluation.{PARTS[name]}")(effort)
+        except OtherCodeError:
+            raise
         except Exception as error:
             broken = Section(name, f"{name} could not be evaluated", "")
             broken.missing(name, "", f"{type(error).__name__}: {error}")
@@ -91,4 +114,5 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
     return sections
 
 
-main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, the same command (without --fresh) continues")
+main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, except those of c_consistency: the same command "
+                                                "(without --fresh) continues")

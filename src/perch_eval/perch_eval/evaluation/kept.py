@@ -17,6 +17,7 @@ from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.workers import failed_run, in_processes
 from perch_eval.evaluation.sections import Effort
+from perch_eval.revision import require_code
 from perch_eval.rows import Rows, rows_of
 
 T = TypeVar("T")
@@ -38,6 +39,7 @@ def cached_figures(effort: Effort, name: str, jobs: Sequence[T], work: Callable[
 
     Raises:
         PerchError: processes die repeatedly at a job, and there is no `on_worker_death`.
+        OtherCodeError: the code was changed meanwhile; the flight that has just ended is not kept.
     """
     effort.state.mkdir(parents=True, exist_ok=True)
     code = effort.code["digest"]
@@ -49,6 +51,8 @@ def cached_figures(effort: Effort, name: str, jobs: Sequence[T], work: Callable[
                           initial=len(before), initial_good=sum(map(good, before)), unit=name.replace("_", " "))
     with closing(Rows(file, known.items())) as rows:
         for job, result in found:
+            require_code(code, "it was changed during the evaluation; start the evaluation again, which flies with the new code, or undo "
+                               "the change, then it continues")
             known[key(job)] = finite(result)
             rows.add((key(job), known[key(job)]))
     return [known[key(job)] for job in jobs]

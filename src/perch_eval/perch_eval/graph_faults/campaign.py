@@ -18,10 +18,11 @@ from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.evaluation.document import machine, table
-from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, PHASES, REAL_TIME, REPORT_LIMIT, SAFE, TRAFFIC, Case, cases
+from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, PHASES, PROCESS, REAL_TIME, REPORT_LIMIT, SAFE, TRAFFIC, Case, cases, judged_end
 from perch_eval.graph_faults.flight import fly
 from perch_eval.revision import banner, code_version
 from perch_eval.rows import Rows, rows_of
+from perch_sim.contact import CRASH_SPEED
 
 EXAMPLES = """examples:
   python3 scripts/faults.py                                    all; interrupted or killed, the same command continues;
@@ -34,7 +35,6 @@ EXAMPLES = """examples:
 
 exit code: 0 every flight was flown, ended safely and its fault was named, 1 otherwise, 2 invalid input, 130 interrupted"""
 ROWS = "rows.jsonl"
-FALL_SPEED = 1.5  # of an impact on the floor that counts as a fall [m/s]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -67,7 +67,8 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
-    """Return the last row of each case flown so far; truncated lines, and flights that ended before their fault, do not count.
+    """Return the last row of each case flown so far, with its end judged; truncated lines, and flights that ended before their fault,
+    do not count.
 
     Args:
         file: file with one row per line.
@@ -76,7 +77,7 @@ def load(file: Path, code: str | None = None) -> dict[Case, dict[str, Any]]:
     found = {}
     for row in rows_of(file):
         if row["struck"] is not None and code in (None, row.get("code")):
-            found[Case(row["fault"], row["node"], row["phase"], row["mode"])] = row
+            found[Case(row["fault"], row["node"], row["phase"], row["mode"])] = row | {"end": judged_end(row["end"], row["impact"])}
     return found
 
 
@@ -122,15 +123,20 @@ def problems(row: dict[str, Any]) -> list[str]:
     if row["struck"] is None:
         return [f"the flight ended before the fault: {row['goal']}"]
     found = [] if row["end"] in SAFE else [f"ended {row['end']}"]
-    if (row["named"] is None or row["named"] > REPORT_LIMIT) and not without_effect(row):
+    if not in_time(row) and not without_effect(row):
         found.append("not named" if row["named"] is None else f"named after {row['named']:.1f} s")
     found += [f"{name} ended, too" for name in row["ended"]] + [f"left: {one}" for one in row["left"]]
     return found
 
 
+def in_time(row: dict[str, Any]) -> bool:
+    """Return whether the fault was named in time."""
+    return row["named"] is not None and row["named"] <= REPORT_LIMIT
+
+
 def without_effect(row: dict[str, Any]) -> bool:
     """Return whether disturbed messages were not reported in time, but had no effect: the flight perched."""
-    return row["fault"] in TRAFFIC and row["goal"].startswith("perched") and (row["named"] is None or row["named"] > REPORT_LIMIT)
+    return row["fault"] in TRAFFIC and row["goal"].startswith("perched") and not in_time(row)
 
 
 def _ends(rows: Sequence[dict[str, Any]]) -> str:
@@ -141,10 +147,10 @@ def _ends(rows: Sequence[dict[str, Any]]) -> str:
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """Return the page of results in Markdown."""
     struck = [row for row in rows if row["struck"] is not None]
-    hard_impacts = Counter(row["node"] for row in struck if row["impact"] > FALL_SPEED and row["end"] in SAFE)
+    crashed = Counter(row["node"] for row in struck if row["end"] == "crashed")
     safe = [row for row in struck if row["end"] in SAFE]
-    unaffected = [row for row in struck if without_effect(row)]
-    reported = [row for row in struck if row["named"] is not None and row["named"] <= REPORT_LIMIT]
+    of_processes, of_messages = ([in_time(row) for row in struck if row["fault"] in kind] for kind in (PROCESS, TRAFFIC))
+    unaffected = sum(map(without_effect, struck))
     clean = [row for row in rows if not row["left"]]
     commits, others = Counter(row["commit"] for row in rows), sum(bool(row["ended"]) for row in rows)
     text = ["# Faults on the real graph", "", banner(commits, [row.get("code", "") for row in rows]), "",
@@ -152,19 +158,22 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
             f"{len(rows)} of {len(cases())} flights of `surface_90` at " + ", ".join(f"{name} ({n})" for name, n in commits.items())
             + f" on {machine()}.", "",
             f"* **{len(safe)} of {len(struck)} end safely**: hovering, landed, perched, or with the motors off on the ground.",
-            f"* **{len(reported)} of {len(struck) - len(unaffected)} are named within {REPORT_LIMIT:g} s** of the wall clock: a node, or the sender of the",
-            "  goal, names the missing node or messages. Reports by the faulted node or by the launcher are not counted.",
-            f"  Not counted: {len(unaffected)} flights whose messages were disturbed and that perched as if they had not been.",
+            *([f"  Crashed, with an impact of more than {CRASH_SPEED:g} m/s, {crashed.total()}; struck were: "
+               + ", ".join(f"{node} ({n})" for node, n in crashed.items()) + "."] if crashed else []),
+            f"* **{sum(of_processes)} of {len(of_processes)} faults of processes are named within {REPORT_LIMIT:g} s** of the wall clock, and "
+            f"{sum(of_messages)} of {len(of_messages)} disturbances of messages:",
+            "  a node, or the sender of the goal, names the missing node or messages. Reports by the faulted node or by the launcher",
+            f"  are not counted. {unaffected} disturbances that are not named had no effect: the vehicle perched. These are no failures.",
             f"* **{len(clean)} of {len(rows)} leave no residue**: no process, no socket of the lockstep, no shared memory in the end.",
-            f"* {hard_impacts.total()} of those that end safely hit the floor with more than {FALL_SPEED:g} m/s"
-            + (f"; struck were: {', '.join(f'{node} ({n})' for node, n in hard_impacts.items())}." if hard_impacts else "."),
+            "  Before it is counted, the campaign removes the shared memory of these processes that is unused, as `demo.py` does: one that is",
+            "  killed cannot.",
             f"* In {others} flights a node that was not struck ended." if others else "* No other node ended in any flight.",
             "", "The node that is struck has a process of its own. In a quarter of the flights all others have, too; in the rest those",
             "that do not use images share one, as in `demo.py`. Cameras are off; VIO and tags are replaced by their error models",
             "(`perch_eval.modelled_sight_node`). Processes are forked from one that has loaded the code: a restart is quick.",
             "In lockstep a node that hangs is waited for 8 s instead of 60; a plan begins 1.5 s after its request instead of 0.1. The end",
-            "is judged by the truth, for a hover by the controller's state, too, when it has lasted for 4 s. *motors off*: on the ground",
-            "after a fall, or lying tilted; without a controller no other node can hold the vehicle.", "",
+            "is judged by the truth, for a hover by the controller's state, too, when it has lasted for 4 s. *motors off*: on the ground,",
+            "tilted; without a controller no other node can hold the vehicle.", "",
             *table("fault | what happens", FAULTS.items()), "",
             "Messages are disturbed by a relay between publisher and subscribers, which lockstep does not have (its batches go over",
             f"sockets of their own): in real time only. Phases: {', '.join(PHASES)}; messages are disturbed in search and approach, from",

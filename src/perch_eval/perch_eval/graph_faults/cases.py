@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from itertools import product
 from typing import NamedTuple
 
+from perch_sim.contact import CRASH_SPEED
+
 PROCESS = {
     "kill": "SIGKILL; the node stays away",
     "stop": "SIGSTOP; the node hangs until the flight has ended",
@@ -34,7 +36,7 @@ PHASES = ("climb", "search", "approach", "contact", "perched")
 LOCKSTEP, REAL_TIME = "lockstep", "real time"
 MODES = (LOCKSTEP, REAL_TIME)
 SAFE = ("hovering", "landed", "perched", "motors off")
-"""Safe ends; `motors off`: on the ground, tilted by 20 deg or more, motors off."""
+"""Safe ends; `motors off`: on the ground, tilted by 20 deg or more, motors off. Not after a crash."""
 REPORT_LIMIT = 5.0  # wall-clock time from the fault within which it must be reported [s]
 
 NODE_PATTERNS = {
@@ -120,11 +122,16 @@ def ending(now: Situation) -> str:
     return "held with running motors" if now.held else "on the ground with running motors" if now.height < 0.15 else "in flight"
 
 
+def judged_end(end: str, impact: float) -> str:
+    """Return the end of a flight, `crashed` where an impact after the fault [m/s] was faster than the vehicle survives."""
+    return "crashed" if impact > CRASH_SPEED else end
+
+
 def first_report(case: Case, fault_time: float, lines: Iterable[str], received: Iterable[tuple[float, str]]) -> tuple[float, str] | None:
-    """Return the delay [s] and text of the first report that names the fault_time node or its messages; None: there is none.
+    """Return the delay [s] and text of the first report that names the struck node or its messages; None: there is none.
 
     Args:
-        case: the case; log lines of the fault_time node itself do not count.
+        case: the case; log lines of the struck node itself do not count.
         fault_time: time of the fault, seconds since the epoch.
         lines: lines of all logs, each with level, seconds since the epoch and node.
         received: (seconds since the epoch, text) received by the pilot, which sent the goal.

@@ -13,7 +13,7 @@ from typing import Any
 from perch_core.errors import PerchError
 from perch_eval.domain import domain_in_environment
 from perch_eval.fork_server import alive
-from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, REPORT_LIMIT, SAFE, Case, Situation, ending, first_report
+from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, REPORT_LIMIT, SAFE, Case, Situation, ending, first_report, judged_end
 from perch_eval.graph_faults.group import Group
 from perch_eval.graph_faults.ros.watcher import Watcher
 from perch_eval.modelled_sight_node import imageless_launches
@@ -47,15 +47,15 @@ class Row:
     Attributes:
         fault, node, phase, mode, seed: the case.
         commit: commit of the code.
-        injection_wall_time: simulation time of the fault [s]; None: the flight ended before.
+        struck: simulation time of the fault [s]; None: the flight ended before.
         before: height [m], speed [m/s] and tilt [deg] at the fault.
-        end: hovering, landed, perched or motors off; any other end is not safe.
-        first_report: wall-clock time from the fault to its first report [s]; None: it was not reported.
+        end: hovering, landed, perched or motors off; any other end is not safe, such as crashed.
+        named: wall-clock time from the fault to its first report [s]; None: it was not reported.
         words: source and text of that report.
         goal: the mission's result, or the pilot's error message.
         impact: largest normal speed of a contact with the floor or a wall after the fault [m/s].
-        ended_processes: other nodes that ended by themselves.
-        leftovers: processes, sockets and shared memory that remained after all nodes were stopped.
+        ended: other nodes that ended by themselves.
+        left: processes, sockets and shared memory that remained after all nodes were stopped.
         duration: wall-clock time of the flight [s].
     """
 
@@ -78,13 +78,13 @@ class Row:
 
 
 class _FaultInjector:
-    """Applies the fault injection_time its time.
+    """Applies the fault when its time has come.
 
     Attributes:
         received: (seconds since the epoch, text) received by the pilot.
         injection_wall_time: time of the fault, seconds since the epoch; None: not yet.
         injection_time: the same in simulation time [s].
-        before: situation injection_time the fault.
+        before: situation at the fault.
     """
 
     def __init__(self, case: Case, group: Group, watcher: Watcher, takeoff_height: float, pad: Any) -> None:
@@ -198,9 +198,10 @@ def fly(case: Case, folder: Path, commit: str) -> Row:
              if injector.injection_wall_time is not None else None)
     impacts = [c.normal_speed for c in watcher.contacts if c.state in (ContactState.COLLISION, ContactState.GROUND)
                and injector.injection_time is not None and 1e-9 * c.stamp >= injector.injection_time]
+    impact = round(max(impacts, default=0.0), 2)
     after, words = (None, "") if found is None else (round(found[0], 2), found[1][:300])
-    return Row(*case, case.seed, commit, injector.injection_time, injector.before[:3], end, after, words, goal[:300],
-               round(max(impacts, default=0.0), 2), ended, left, round(time.monotonic() - began, 1))
+    return Row(*case, case.seed, commit, injector.injection_time, injector.before[:3], judged_end(end, impact),
+               after, words, goal[:300], impact, ended, left, round(time.monotonic() - began, 1))
 
 
 def _wait_for_end(pilot: MissionClient, watcher: Watcher, injector: _FaultInjector) -> str:

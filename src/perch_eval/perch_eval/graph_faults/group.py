@@ -54,6 +54,7 @@ class Group:
             self.nodes.add("/relay")
         self.pids: dict[str, int] = {}
         self._sessions: list[int] = []
+        self._killed: tuple[str, ...] = ()  # processes that did not end after SIGINT
         self._memory = SharedMemory()
         self._ports_before = port_files(domain)
 
@@ -88,6 +89,8 @@ class Group:
         self._memory.observe((*self.pids.values(), os.getpid()))
         running = [pid for pid in self.pids.values() if alive(pid)]
         for number, timeout in zip((signal.SIGINT, signal.SIGKILL), STOP_TIMEOUTS):
+            if number == signal.SIGKILL:
+                self._killed = tuple(name for name, pid in self.pids.items() if pid in running)
             for pid in running:
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGCONT)
@@ -98,14 +101,15 @@ class Group:
                 time.sleep(0.02)
 
     def leftovers(self) -> tuple[str, ...]:
-        """Clean shared memory and return what remains, as text. All processes must be stopped and the pilot closed."""
+        """Clean shared memory, which a killed process cannot, and return what remains and what had to be killed at the end, as text.
+        All processes must be stopped and the pilot closed."""
         end = time.monotonic() + CLEANUP_TIME
         while True:  # threads of a process that has ended may hold what it had open for a moment
             self._memory.clean()
             processes = [f"process {pid}" for leader in self._sessions for pid in session(leader)]
             found = (*processes, *self._sockets(), *self._shared_memory())
             if not found or time.monotonic() > end:
-                return found
+                return (*(f"process {name} after SIGINT" for name in self._killed), *found)
             time.sleep(0.1)
 
     def _sockets(self) -> list[str]:

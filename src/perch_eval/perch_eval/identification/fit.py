@@ -121,7 +121,7 @@ def rates(record: Record, axis: int, delay: float | None = None, spread: float =
     """Identify lag and gain of one axis of the rate loop and, if `delay` is None, its delay, which is the third value.
 
     Args:
-        responses: record of the flight.
+        record: record of the flight.
         axis: index of the axis x, y or z.
         delay, spread: known delay and its standard deviation [s]. The latter adds to the lag's, as commands that are slow against
             the lag determine only the sum of lag and delay.

@@ -54,7 +54,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, covariances: np.ndarray | 
         covariances: of the estimate's position in its W [m^2], shape (n, 3, 3).
 
     Raises:
-        RecordingError: fewer than `LEAST_POSES` poses have a true pose at their stamp.
+        RecordingError: fewer than `MIN_POSES` poses have a true pose at their stamp.
     """
     true, kept = truth.at(estimate.stamps)
     if kept.sum() < MIN_POSES:
