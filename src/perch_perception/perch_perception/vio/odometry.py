@@ -231,11 +231,12 @@ class VisualInertialOdometry:
     def _may_start_at_rest(self, steps: np.ndarray) -> bool:
         """Whether the last IMU steps (m, 9) and images are those of a vehicle at rest.
 
-        With odometry it may hover, where for moments either looks like rest: the IMU must be quiet and the image static for long.
+        With odometry, or after a loss in motion, it may hover, where for moments either looks like rest: the IMU must be quiet and
+        the image static for long.
         """
         biases, variance = self._biases or (None, None)
         for_long = self._recent_views.is_static(STATIC_DURATION)
-        if self._odometry:
+        if self._odometry or self._last_pose.known_at is not None:
             return for_long is not False and is_at_rest(steps, biases, variance)
         return self._recent_views.is_static() is not False and is_at_rest(steps, biases, variance, bool(for_long))
 
