@@ -236,6 +236,14 @@ def test_a_filter_lost_in_a_hover_that_looks_like_rest_does_not_start_at_rest(dr
     assert any(result.outcome is FrameOutcome.RESTING for result in after_loss(drift=drift, shake=shake)[1]) is rests
 
 
+@pytest.mark.parametrize("gyro_bias, accel_bias, begins_with", [(0.05, 0.8, 0.05), (0.5, 0.8, 0.0), (0.05, 1.6, 0.0)])
+def test_biases_of_a_lost_filter_do_not_keep_a_standing_vehicle_from_its_start(gyro_bias, accel_bias, begins_with):
+    """They are wrong by many of their standard deviations; those that no sensor has do not count in a start in motion either."""
+    vio, out = after_loss(lambda state: (state.gyro_bias.__setitem__(0, gyro_bias), state.accel_bias.__setitem__(2, accel_bias)))
+    assert out[-1].outcome is FrameOutcome.RESTING
+    assert vio._motion_start._known_bias[0] == begins_with
+
+
 @pytest.mark.parametrize("used, refused, lost", [(19, 24, False), (20, 81, True), (0, 21, True), (0, 20, False)])
 def test_bad_tracks_alone_do_not_end_the_filter(used, refused, lost):
     """It is lost where it refuses nearly all that it sees."""

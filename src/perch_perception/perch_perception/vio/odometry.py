@@ -15,7 +15,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample, OdometryState
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, without_gaps
 from perch_perception.ukf.odometry import pose_of
-from perch_perception.ukf.stillness import energy, is_at_rest, window
+from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS, energy, is_at_rest, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
@@ -67,7 +67,7 @@ class VisualInertialOdometry:
         self._floor = floor
         self._views: deque[tuple[int, Features]] = deque()  # (exposure, features) at rest, not passed by the filter
         self._recent_views = RecentViews()
-        self._biases: tuple[np.ndarray, np.ndarray] | None = None  # of gyro and accelerometer (6,) and their variances, of the last filter
+        self._gyro_bias: np.ndarray | None = None  # of the last filter whose biases may be true
         self._odometry: deque[OdometryState] | None = deque(maxlen=_KEPT_ODOMETRY)  # of the estimator; None from the first start on
         self._at_rest = False
         self._noise_factor = 1.0  # variance of the IMU at rest over that of the sensor's noise, as last measured
@@ -102,7 +102,7 @@ class VisualInertialOdometry:
 
     def _begin_motion_start(self) -> None:
         """Begin to collect frames for a start in motion."""
-        self._motion_start = motion_start.MotionStart(self.config, self.mount, None if self._biases is None else self._biases[0][:3])
+        self._motion_start = motion_start.MotionStart(self.config, self.mount, self._gyro_bias)
         self._last_pose.begin_rotation(self._motion_start.gyro_bias)
 
     @property
@@ -232,13 +232,12 @@ class VisualInertialOdometry:
         """Whether the last IMU steps (m, 9) and images are those of a vehicle at rest.
 
         With odometry, or after a loss in motion, it may hover, where for moments either looks like rest: the IMU must be quiet and
-        the image static for long.
+        the image static for long. The biases of an earlier filter do not count: they may be why it was lost.
         """
-        biases, variance = self._biases or (None, None)
         for_long = self._recent_views.is_static(STATIC_DURATION)
         if self._odometry or self._last_pose.known_at is not None:
-            return for_long is not False and is_at_rest(steps, biases, variance)
-        return self._recent_views.is_static() is not False and is_at_rest(steps, biases, variance, bool(for_long))
+            return for_long is not False and is_at_rest(steps)
+        return self._recent_views.is_static() is not False and is_at_rest(steps, image_is_static=bool(for_long))
 
     def _take_odometry(self, exposure: int) -> None:
         """Make the newest odometry before an exposure the known pose."""
@@ -361,11 +360,12 @@ class VisualInertialOdometry:
         self.filter, self._at_rest, self._at_configured_start, self.restarts = None, False, False, self.restarts + 1
 
     def _store_pose(self) -> None:
-        """Store the pose and biases for a new start, unless they are not finite."""
+        """Store pose and gyro bias for a new start, unless they are not finite or the biases are beyond any sensor's."""
         s = self._running.state
         if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
             self._last_pose.pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), start.positive(_estimate(s).pose_covariance[start.POSE_ROWS]))
-            self._biases = _biases(s)
+        if np.linalg.norm(s.gyro_bias) < MAX_GYRO_BIAS and np.linalg.norm(s.accel_bias) < MAX_ACCEL_BIAS:
+            self._gyro_bias = s.gyro_bias.copy()
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport, now: at.State | None = None) -> VioResult:
         """Return a frame's result; `now`: the state at its exposure; None: the filter's state."""
