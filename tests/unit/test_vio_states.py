@@ -244,6 +244,14 @@ def test_biases_of_a_lost_filter_do_not_keep_a_standing_vehicle_from_its_start(g
     assert vio._motion_start._known_bias[0] == begins_with
 
 
+def test_a_hot_pixel_in_the_dark_is_no_frozen_camera():
+    image = BLANK.copy()
+    image[160, 160] = 40
+    assert after_loss(image=image)[1][-1].outcome is FrameOutcome.RESTING
+    image[:, ::32] = 40
+    assert after_loss(image=image)[1][-1].outcome is FrameOutcome.REPEATED
+
+
 @pytest.mark.parametrize("used, refused, lost", [(19, 24, False), (20, 81, True), (0, 21, True), (0, 20, False)])
 def test_bad_tracks_alone_do_not_end_the_filter(used, refused, lost):
     """It is lost where it refuses nearly all that it sees."""

@@ -171,8 +171,8 @@ class VisualInertialOdometry:
             return FrameOutcome.FUTURE
         last, self._last_pixels = self._last_pixels, image[::16, ::16].copy()
         in_motion = not self._at_rest and (self.filter is not None or self._last_pose.known_at is not None)
-        if in_motion and np.array_equal(self._last_pixels, last) and last.min() < last.max():  # in the dark all may be equal
-            return FrameOutcome.REPEATED
+        if in_motion and np.array_equal(self._last_pixels, last) and np.ptp(np.percentile(last, [10, 90])) > 0:
+            return FrameOutcome.REPEATED  # in the dark all may be equal, but for hot pixels
         return FrameOutcome.TOO_OLD if exposure < self._imu.oldest else None
 
     def _resume(self, exposure: int) -> None:
