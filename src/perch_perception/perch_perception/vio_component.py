@@ -73,6 +73,11 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         self._outcome: FrameOutcome | None = None
         self._diagnosed: int | None = None
 
+    @property
+    def missing(self) -> str:
+        """Description of what all images wait for: the camera, or the first IMU sample."""
+        return super().missing or ("" if self._vio.has_imu else f"no {self._channel('imu')} yet")
+
     def use_camera(self, mount: CameraMount) -> None:
         """Pass a changed camera to the odometry."""
         if mount is not self._vio.mount:

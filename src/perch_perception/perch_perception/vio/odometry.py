@@ -106,6 +106,11 @@ class VisualInertialOdometry:
         self._last_pose.begin_rotation(self._motion_start.gyro_bias)
 
     @property
+    def has_imu(self) -> bool:
+        """Whether there has been an IMU sample."""
+        return self._imu.last is not None
+
+    @property
     def gyro_sigma(self) -> float:
         """1 sigma of the newest gyro sample [rad/s]."""
         return self._imu.gyro_sigma
