@@ -244,6 +244,14 @@ def test_biases_of_a_lost_filter_do_not_keep_a_standing_vehicle_from_its_start(g
     assert vio._motion_start._known_bias[0] == begins_with
 
 
+def test_after_a_state_that_is_not_finite_the_pose_is_unknown():
+    """Not the configured one, which the vehicle has left."""
+    vio, out = after_loss(lambda state: (state.p_WB.__setitem__(0, 8.0), state.P.__setitem__((0, 0), np.nan)))
+    assert out[-1].outcome is FrameOutcome.RESTING
+    sigma = np.sqrt(np.diag(out[-1].estimate.pose_covariance))
+    assert sigma[:3].min() > 100.0 and sigma[5] > 1.0
+
+
 def test_a_hot_pixel_in_the_dark_is_no_frozen_camera():
     image = BLANK.copy()
     image[160, 160] = 40

@@ -365,10 +365,15 @@ class VisualInertialOdometry:
         self.filter, self._at_rest, self._at_configured_start, self.restarts = None, False, False, self.restarts + 1
 
     def _store_pose(self) -> None:
-        """Store pose and gyro bias for a new start, unless they are not finite or the biases are beyond any sensor's."""
+        """Store pose and gyro bias for a new start.
+
+        A pose that is not finite is unknown from now on; biases beyond any sensor's are not stored.
+        """
         s = self._running.state
-        if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
+        if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all() and np.isfinite(s.R_WB).all():
             self._last_pose.pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), start.positive(_estimate(s).pose_covariance[start.POSE_ROWS]))
+        else:
+            self._last_pose.forget()
         if np.linalg.norm(s.gyro_bias) < MAX_GYRO_BIAS and np.linalg.norm(s.accel_bias) < MAX_ACCEL_BIAS:
             self._gyro_bias = s.gyro_bias.copy()
 
