@@ -8,6 +8,7 @@ from perch_core import so3
 from perch_core.values import ImuSample, InertialState, OdometryState, Transform
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.ukf import UkfConfig
+from perch_perception.vio_component import VioComponent, VioComponentConfig
 
 from unit.component_outputs import Outputs
 
@@ -195,6 +196,16 @@ def test_a_saturated_sample_gets_its_odometry():
         hover.estimator.on_imu(hover.sample(w_B=(40.0, 0.0, 0.0)))
         assert hover.last.stamp == hover.now
     hover.fly(1.0).assert_running()
+
+
+@pytest.mark.parametrize("kind, config", [(StateEstimator, UkfConfig), (VioComponent, VioComponentConfig)])
+def test_gaps_and_saturated_samples_are_logged(kind, config):
+    component = kind(config())
+    out = Outputs(component)
+    for stamp, rate in ((1000, 0.0), (1002, 0.1), (1004, 0.2), (1006, 0.3), (1400, 0.4), (1402, 40.0)):
+        component.on_imu(ImuSample(stamp * MS, (rate, 0.0, 0.0), (0.0, 0.0, 9.81)))
+    gap, saturated = out.warnings()
+    assert f"{1400 * MS} ns used after a gap" in gap and f"{1402 * MS} ns used with inflated noise" in saturated
 
 
 def test_samples_with_stamps_that_go_back_or_far_ahead_give_nothing():

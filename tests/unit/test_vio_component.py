@@ -122,6 +122,17 @@ def test_images_wait_for_camera_info_and_the_imu():
     assert len(flight.out["diagnostics"]) == 1
 
 
+def test_a_missing_imu_is_named():
+    component = VioComponent(VioComponentConfig())
+    out = Outputs(component)
+    component.on_camera_info(CameraModel(0, FRAME, DOWN.camera))
+    for k in range(11):
+        component.on_image(CameraImage(33_000_000 * k, FRAME, 640, 480, "mono8", np.zeros((480, 640), np.uint8)))
+    assert any("images are waiting (no imu/data_raw yet)" in text for text in out.warnings())
+    component.on_imu(ImuSample(0, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)))
+    assert component.missing == ""
+
+
 @pytest.mark.parametrize("change", [dict(encoding="mono16"), dict(width=320), dict(pixels=np.zeros((480, 640), np.float32)),
                                     dict(pixels=lambda region: None)])
 def test_an_image_of_another_kind_is_refused(change):

@@ -207,6 +207,59 @@ def test_an_unknown_heading_does_not_end_the_filter():
     assert divergence(state, 20, 0, 15) == ""
 
 
+def after_loss(change=lambda state: None, drift=0.0, shake=1.0, image=BLANK):
+    """Results of 1.2 s after a loss in a hover of a filter whose state was changed; the IMU is quiet but for `shake` times its noise.
+
+    The view drifts by `drift` [px/s].
+    """
+    rng, vio, out, frame = np.random.default_rng(3), VisualInertialOdometry(VioConfig(), MOUNT), [], 0.3
+    pixels, imu = rng.uniform([40, 40], [600, 440], (60, 2)), VioConfig().imu
+    vio.tracker = GivenTracks(lambda: (np.arange(60), pixels + [drift * frame, 0.0]))
+    noise = shake * np.repeat([imu.gyro_noise_density, imu.accel_noise_density], 3) / np.sqrt(0.002)
+    for k in range(750):
+        read = noise * rng.normal(size=6) + [0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY]
+        vio.add_imu(ImuSample(2_000_000 * k, tuple(read[:3]), tuple(read[3:])))
+        if k == 140:
+            pose = configured_pose(np.zeros(3), 0.0)
+            vio._begin(initial_state(vio.config, MOUNT, 280_000_000, np.eye(3), pose, np.zeros(3), np.zeros(3), 0.01, 0.05, 0.002))
+            change(vio.filter.state)
+            vio._drop_filter()
+        if 0.002 * k > frame + 0.02:
+            out.append(vio.add_image(round((frame + MOUNT.stamp_offset) * 1e9), image))
+            frame += 1 / 30
+    return vio, out
+
+
+@pytest.mark.parametrize("drift, shake, rests", [(0.0, 1.0, True), (0.8, 5.0, False)])
+def test_a_filter_lost_in_a_hover_that_looks_like_rest_does_not_start_at_rest(drift, shake, rests):
+    """29 mm/s at 10 m: a static image excuses no vibration, as where the node was restarted."""
+    assert any(result.outcome is FrameOutcome.RESTING for result in after_loss(drift=drift, shake=shake)[1]) is rests
+
+
+@pytest.mark.parametrize("gyro_bias, accel_bias, begins_with", [(0.05, 0.8, 0.05), (0.5, 0.8, 0.0), (0.05, 1.6, 0.0)])
+def test_biases_of_a_lost_filter_do_not_keep_a_standing_vehicle_from_its_start(gyro_bias, accel_bias, begins_with):
+    """They are wrong by many of their standard deviations; those that no sensor has do not count in a start in motion either."""
+    vio, out = after_loss(lambda state: (state.gyro_bias.__setitem__(0, gyro_bias), state.accel_bias.__setitem__(2, accel_bias)))
+    assert out[-1].outcome is FrameOutcome.RESTING
+    assert vio._motion_start._known_bias[0] == begins_with
+
+
+def test_after_a_state_that_is_not_finite_the_pose_is_unknown():
+    """Not the configured one, which the vehicle has left."""
+    vio, out = after_loss(lambda state: (state.p_WB.__setitem__(0, 8.0), state.P.__setitem__((0, 0), np.nan)))
+    assert out[-1].outcome is FrameOutcome.RESTING
+    sigma = np.sqrt(np.diag(out[-1].estimate.pose_covariance))
+    assert sigma[:3].min() > 100.0 and sigma[5] > 1.0
+
+
+def test_a_hot_pixel_in_the_dark_is_no_frozen_camera():
+    image = BLANK.copy()
+    image[160, 160] = 40
+    assert after_loss(image=image)[1][-1].outcome is FrameOutcome.RESTING
+    image[:, ::32] = 40
+    assert after_loss(image=image)[1][-1].outcome is FrameOutcome.REPEATED
+
+
 @pytest.mark.parametrize("used, refused, lost", [(19, 24, False), (20, 81, True), (0, 21, True), (0, 20, False)])
 def test_bad_tracks_alone_do_not_end_the_filter(used, refused, lost):
     """It is lost where it refuses nearly all that it sees."""

@@ -17,6 +17,7 @@ from perch_perception.imu_intake import ImuIntake
 from perch_perception.sensor_file import imu_noise
 from perch_perception.ukf import Estimate, Estimator, VioOutcome, VioPose
 from perch_perception.ukf.estimator import COVARIANCE_STRIDE
+from perch_perception.ukf.imu_buffer import ImuOutcome
 from perch_perception.ukf.odometry import covariances, pose_of, state_of
 from perch_perception.world_frames import MAP, is_world
 
@@ -81,7 +82,7 @@ class StateEstimator(Component[EstimatorConfig]):
         if self._pending:
             self._use_vio()
         outcome = self._estimator.add_imu(taken)
-        if not outcome.used:
+        if outcome is not ImuOutcome.USED:
             self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
         estimate = self._estimator.estimate
         if estimate is not None:

@@ -15,6 +15,7 @@ from perch_perception.camera_component import CameraComponent, extrinsics_parame
 from perch_perception.images import ImageError, mono_image
 from perch_perception.imu_intake import ImuIntake
 from perch_perception.sensor_file import calibration_sigmas, imu_noise, sensors_parameter
+from perch_perception.ukf.imu_buffer import ImuOutcome
 from perch_perception.ukf.odometry import covariances
 from perch_perception.vio import FrameOutcome, VioConfig, VioPoseEstimate, VioResult, VisualInertialOdometry
 from perch_perception.vio.drawing import TrackPainter
@@ -72,6 +73,11 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         self._outcome: FrameOutcome | None = None
         self._diagnosed: int | None = None
 
+    @property
+    def missing(self) -> str:
+        """Description of what all images wait for: the camera, or the first IMU sample."""
+        return super().missing or ("" if self._vio.has_imu else f"no {self._channel('imu')} yet")
+
     def use_camera(self, mount: CameraMount) -> None:
         """Pass a changed camera to the odometry."""
         if mount is not self._vio.mount:
@@ -91,7 +97,7 @@ class VioComponent(CameraComponent[VioComponentConfig]):
             self._begin()
             self.clear_queue()
         outcome = self._vio.add_imu(taken)
-        if not outcome.used:
+        if outcome is not ImuOutcome.USED:
             self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
         if self._queue:
             self.advance()

@@ -12,6 +12,8 @@ from perch_perception.vio import state as at
 from perch_perception.vio.preintegration import preintegrate
 from perch_perception.vio.start import KnownPose
 
+_ANYWHERE = 1000.0  # 1 sigma of a position of which nothing is known [m]
+
 
 class LastPose:
     """The pose known last, and the rotation since.
@@ -42,6 +44,11 @@ class LastPose:
         dR, J, P = self._rotation
         change = np.zeros(3) if gyro_bias is None else gyro_bias - self._gyro_bias
         return self.pose.turned(self.pose.R_WB @ dR @ so3.exp(J @ change), J, P)
+
+    def forget(self) -> None:
+        """Make all positions and headings alike."""
+        self.pose = replace(self.pose, covariance=_ANYWHERE**2 * np.eye(4))
+        self.forget_heading()
 
     def forget_heading(self) -> None:
         """Make all headings alike."""

@@ -15,7 +15,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample, OdometryState
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, without_gaps
 from perch_perception.ukf.odometry import pose_of
-from perch_perception.ukf.stillness import energy, is_at_rest, window
+from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS, energy, is_at_rest, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
@@ -67,7 +67,7 @@ class VisualInertialOdometry:
         self._floor = floor
         self._views: deque[tuple[int, Features]] = deque()  # (exposure, features) at rest, not passed by the filter
         self._recent_views = RecentViews()
-        self._biases: tuple[np.ndarray, np.ndarray] | None = None  # of gyro and accelerometer (6,) and their variances, of the last filter
+        self._gyro_bias: np.ndarray | None = None  # of the last filter whose biases may be true
         self._odometry: deque[OdometryState] | None = deque(maxlen=_KEPT_ODOMETRY)  # of the estimator; None from the first start on
         self._at_rest = False
         self._noise_factor = 1.0  # variance of the IMU at rest over that of the sensor's noise, as last measured
@@ -102,8 +102,13 @@ class VisualInertialOdometry:
 
     def _begin_motion_start(self) -> None:
         """Begin to collect frames for a start in motion."""
-        self._motion_start = motion_start.MotionStart(self.config, self.mount, None if self._biases is None else self._biases[0][:3])
+        self._motion_start = motion_start.MotionStart(self.config, self.mount, self._gyro_bias)
         self._last_pose.begin_rotation(self._motion_start.gyro_bias)
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether there has been an IMU sample."""
+        return self._imu.last is not None
 
     @property
     def gyro_sigma(self) -> float:
@@ -171,8 +176,8 @@ class VisualInertialOdometry:
             return FrameOutcome.FUTURE
         last, self._last_pixels = self._last_pixels, image[::16, ::16].copy()
         in_motion = not self._at_rest and (self.filter is not None or self._last_pose.known_at is not None)
-        if in_motion and np.array_equal(self._last_pixels, last) and last.min() < last.max():  # in the dark all may be equal
-            return FrameOutcome.REPEATED
+        if in_motion and np.array_equal(self._last_pixels, last) and np.ptp(np.percentile(last, [10, 90])) > 0:
+            return FrameOutcome.REPEATED  # in the dark all may be equal, but for hot pixels
         return FrameOutcome.TOO_OLD if exposure < self._imu.oldest else None
 
     def _resume(self, exposure: int) -> None:
@@ -231,13 +236,13 @@ class VisualInertialOdometry:
     def _may_start_at_rest(self, steps: np.ndarray) -> bool:
         """Whether the last IMU steps (m, 9) and images are those of a vehicle at rest.
 
-        With odometry it may hover, where for moments either looks like rest: the IMU must be quiet and the image static for long.
+        With odometry, or after a loss in motion, it may hover, where for moments either looks like rest: the IMU must be quiet and
+        the image static for long. The biases of an earlier filter do not count: they may be why it was lost.
         """
-        biases, variance = self._biases or (None, None)
         for_long = self._recent_views.is_static(STATIC_DURATION)
-        if self._odometry:
-            return for_long is not False and is_at_rest(steps, biases, variance)
-        return self._recent_views.is_static() is not False and is_at_rest(steps, biases, variance, bool(for_long))
+        if self._odometry or self._last_pose.known_at is not None:
+            return for_long is not False and is_at_rest(steps)
+        return self._recent_views.is_static() is not False and is_at_rest(steps, image_is_static=bool(for_long))
 
     def _take_odometry(self, exposure: int) -> None:
         """Make the newest odometry before an exposure the known pose."""
@@ -360,11 +365,17 @@ class VisualInertialOdometry:
         self.filter, self._at_rest, self._at_configured_start, self.restarts = None, False, False, self.restarts + 1
 
     def _store_pose(self) -> None:
-        """Store the pose and biases for a new start, unless they are not finite."""
+        """Store pose and gyro bias for a new start.
+
+        A pose that is not finite is unknown from now on; biases beyond any sensor's are not stored.
+        """
         s = self._running.state
-        if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all():
+        if np.isfinite(s.P).all() and np.isfinite(s.p_WB).all() and np.isfinite(s.R_WB).all():
             self._last_pose.pose = KnownPose(s.p_WB.copy(), s.R_WB.copy(), start.positive(_estimate(s).pose_covariance[start.POSE_ROWS]))
-            self._biases = _biases(s)
+        else:
+            self._last_pose.forget()
+        if np.linalg.norm(s.gyro_bias) < MAX_GYRO_BIAS and np.linalg.norm(s.accel_bias) < MAX_ACCEL_BIAS:
+            self._gyro_bias = s.gyro_bias.copy()
 
     def _result(self, outcome: FrameOutcome, features: Features, report: FrameReport, now: at.State | None = None) -> VioResult:
         """Return a frame's result; `now`: the state at its exposure; None: the filter's state."""
