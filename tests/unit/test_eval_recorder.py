@@ -16,7 +16,7 @@ from perch_core.trajectory import rest_to_rest
 from perch_eval.flight import Flight, timed
 from perch_eval.mcap_log import read
 from perch_eval import demo
-from perch_eval.report import build_report, summary
+from perch_eval.report import build_report, outcome_text, summary
 from perch_eval.ros.recorded_flight import RecordedFlight, write
 from perch_eval.ros.recorder import CHANNELS, Recorder, RecorderParameters
 from perch_core.component import Diagnostics, Input, ports
@@ -335,3 +335,11 @@ def test_a_recorder_that_is_started_again_keeps_what_there_is(tmp_path):
             True] * (name != "f.mcap")
         assert len(RecordedFlight(tmp_path / name).values("odometry")) == 10
     assert len(RecordedFlight(tmp_path / "f.mcap").values("odometry")) == 10
+
+
+@pytest.mark.parametrize("outcome, cause, words", [
+    ("perched", "perched", "perched"), ("perched", "came_off", "perched (came_off: "), ("missed", "missed_pad", "missed (missed_pad: "),
+    ("failed", "lost_track", "failed"), ("cancelled", "timeout", "cancelled")])
+def test_a_heading_has_the_cause_where_the_truth_says_more_than_the_mission(outcome, cause, words):
+    said = outcome_text({"outcome": outcome, "cause": cause})
+    assert said.startswith(words) and ("(" in said) == ("(" in words)

@@ -20,6 +20,7 @@ from perch_eval.campaign.causes import MEANING, SUCCESS, cause_of
 from perch_eval.evaluation.document import machine
 from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
+from perch_eval.goal import SUCCESSES
 from perch_eval.identification.responses import inner_loop_figure
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import InspectionResult, recorded_inspection
@@ -130,9 +131,9 @@ def _centimetres(values: Any) -> str:
 
 
 def outcome_text(report: dict[str, Any]) -> str:
-    """Return the mission's outcome in words, with the cause of failure, as in campaigns: a success is one by the truth, too."""
+    """Return the mission's outcome, with the cause, as in campaigns, where the truth says more: a success is one by the truth, too."""
     outcome, cause = report["outcome"], report["cause"]
-    return outcome if cause == SUCCESS else f"{outcome} ({cause}: {MEANING[cause]})"
+    return f"{outcome} ({cause}: {MEANING[cause]})" if cause != SUCCESS and outcome in (*SUCCESSES, "missed") else outcome
 
 
 def summary(report: dict[str, Any]) -> list[tuple[str, str]]:

@@ -136,15 +136,17 @@ class PoseBuffer:
         unexplained = state.p_WB - before.p_WB - (0.5 * dt) * (before.v_WB + state.v_WB)
         while len(window) > 1 and window[1][0] <= state.time - JUMP_WITHIN:
             window.popleft()
-        recent = window[-1][1] + unexplained - window[0][1]
+        uncounted = window[-1][1] + unexplained
+        recent = uncounted - window[0][1]
         if math.sqrt(recent @ recent) > JUMP:
             counted, self._last_jump = recent, state.time
+            window.clear()  # what led to the jump is counted
         elif state.time - self._last_jump < PAUSE:
             counted = unexplained
         else:
             share = 0.0 if dt > MAX_GAP else min(max(math.sqrt(state.v_WB @ state.v_WB) / SLOW - 1.0, 0.0), 1.0)
             counted = share * unexplained
-        window.append((state.time, window[-1][1] + unexplained - counted))
+        window.append((state.time, uncounted - counted))
         return self._corrected[-1] + counted
 
 

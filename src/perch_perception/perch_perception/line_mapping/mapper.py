@@ -215,7 +215,7 @@ class LineMapper:
         lines = []
         for k in range(pieces):
             a, b = low + length * k / pieces, low + length * (k + 1) / pieces
-            covariance = self._covariance(track, estimate, 0.5 * (a + b))
+            covariance = self._covariance(estimate, 0.5 * (a + b))
             sigma = largest_sigma(covariance)
             if sigma > self.settings.max_sigma:
                 return [], f"position uncertainty of {sigma:.2f} m is too large"
@@ -224,20 +224,15 @@ class LineMapper:
                                          self._direction_sigma(estimate), track.count))
         return lines, None
 
-    def _covariance(self, track: _Track, estimate: WireEstimate, s: float) -> np.ndarray:
-        """Return the covariance of the point at s relative to the vehicle, shape (3, 3) [m^2].
+    def _covariance(self, estimate: WireEstimate, s: float) -> np.ndarray:
+        """Return the covariance of the point at s relative to the vehicle, from sightings and attitude, shape (3, 3) [m^2].
 
-        It has three parts: the sightings and the camera's mount, by the fit; the drift of the odometry since the last sighting; and
-        the attitude.
+        The sightings' part includes the camera's mount, which the fit estimates. The odometry's position is excluded: its drift
+        moves vehicle and wires together.
         """
         assert self._body is not None  # it was seen from somewhere
-        body, last = self._body, track.last
-        lever = so3.hat(estimate.curve.at(s) - body.p_WB)
-        covariance = estimate.point_covariance(s) + lever @ body.covariance[3:, 3:] @ lever.T
-        if body.time > last.time:
-            moved = float(np.linalg.norm(body.p_WB - last.p_WC))
-            covariance = covariance + self.settings.triangulation.drift_variance(body.time - last.time, moved) * np.eye(3)
-        return covariance
+        lever = so3.hat(estimate.curve.at(s) - self._body.p_WB)
+        return estimate.point_covariance(s) + lever @ self._body.covariance[3:, 3:] @ lever.T
 
     def _direction_sigma(self, estimate: WireEstimate) -> float:
         assert self._body is not None

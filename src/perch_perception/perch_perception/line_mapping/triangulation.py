@@ -48,10 +48,6 @@ class TriangulationConfig:
     radius: float = config.quantity(0.03, unit="m", above=0.0, high=0.5,
                                     doc="radius of a wire that is too thin to be measured")
 
-    def drift_variance(self, waited: np.ndarray | float, moved: np.ndarray | float) -> np.ndarray | float:
-        """Variance of the odometry's random walk over a time [s] and a distance [m], per axis [m^2]."""
-        return self.pose_drift**2 * waited + self.pose_drift_moved**2 * moved
-
 
 class Undetermined(PerchError):
     """Raised when the sightings do not determine a wire; the message gives the reason."""
@@ -180,7 +176,7 @@ def _drifted(observations: Sequence[LineObservation], settings: TriangulationCon
     times, centres = np.array([o.time for o in observations]), np.array([o.p_WC for o in observations])
     waited = np.maximum(np.diff(times, prepend=times[0]), 0.0)
     moved = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
-    return np.asarray(settings.drift_variance(waited, moved))
+    return settings.pose_drift**2 * waited + settings.pose_drift_moved**2 * moved
 
 
 def _normal_equations(linear: tuple[np.ndarray, np.ndarray], weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

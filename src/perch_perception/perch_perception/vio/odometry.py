@@ -176,7 +176,7 @@ class VisualInertialOdometry:
             return FrameOutcome.FUTURE
         last, self._last_pixels = self._last_pixels, image[::16, ::16].copy()
         in_motion = not self._at_rest and (self.filter is not None or self._last_pose.known_at is not None)
-        if in_motion and np.array_equal(self._last_pixels, last) and np.ptp(np.percentile(last, [10, 90])) > 0:
+        if in_motion and np.array_equal(self._last_pixels, last) and np.count_nonzero(last != np.median(last)) > last.size // 100:
             return FrameOutcome.REPEATED  # in the dark all may be equal, but for hot pixels
         return FrameOutcome.TOO_OLD if exposure < self._imu.oldest else None
 
