@@ -382,14 +382,19 @@ def test_answers_come_in_the_first_batch_in_which_they_count():
     assert said(LocalParticipant(Asking(Nothing())), 0, 0) == ["tick 0"]
 
 
-def test_a_batch_waits_for_an_answer_that_counts_from_its_stamp_or_before():
-    answers = []
+def asking_with_open_answers() -> tuple[LocalParticipant, list[Answer]]:
+    """A participant that asks, and the answers to its requests, which the test gives."""
+    answers: list[Answer] = []
 
     def ask(channel, request):
         answers.append(Answer())
         return answers[-1]
 
-    asking = LocalParticipant(Asking(Nothing()), send_request=ask)
+    return LocalParticipant(Asking(Nothing()), send_request=ask), answers
+
+
+def test_a_batch_waits_for_an_answer_that_counts_from_its_stamp_or_before():
+    asking, answers = asking_with_open_answers()
     assert said(asking, 0, 30 * MS) == ["tick 0"] and said(asking, 20 * MS) == ["tick 20000000"]
     assert said(asking, 40 * MS) is None and asking.results() is None
     answers[0]("there")
@@ -465,13 +470,7 @@ def test_a_batch_that_is_cut_short_is_refused():
 
 
 def test_a_flight_begun_anew_has_its_timers_at_once_and_the_answers_of_the_old_one():
-    answers = []
-
-    def ask(channel, request):
-        answers.append(Answer())
-        return answers[-1]
-
-    asking = LocalParticipant(Asking(Nothing()), send_request=ask)
+    asking, answers = asking_with_open_answers()
     assert said(asking, 40_000 * MS, 60_000 * MS) == ["tick 40000000000"]
     assert said(asking, 1_000 * MS) is None
     answers[0]("of the old one")
