@@ -98,6 +98,16 @@ def test_an_abort_at_any_time_finds_a_recovery(planner: PowerlinePlanner, planne
     assert so3.quat_to_matrix(plan.recovery.states[-1, Q])[2, 2] > np.cos(np.radians(0.1))
 
 
+def test_a_recovery_is_found_from_each_instant_of_the_way_to_an_upside_down_perch(planner: PowerlinePlanner) -> None:
+    """About 0.35 s before the contact the vehicle rises at 3.7 m/s, tipped by 90 degrees, with its rotors idle."""
+    request = problem.load("powerline_line_180").request(VEHICLE)
+    perch = planner.plan(request).perch
+    for before in (0.37, 0.36, 0.35, 0.34):
+        state = perch.states[np.searchsorted(perch.times, perch.duration - before)]
+        plan = planner.plan(replace(request, start=state, hover=request.start[P], perch=None, recovery_only=True))
+        assert all(bound.holds for bound in plan.bounds)
+
+
 @pytest.mark.parametrize("radius, air", [(0.03, 0.002), (0.03, -0.005), (0.015, -0.005)])
 def test_a_recovery_begins_even_where_the_flight_has_eaten_the_margin(planner: PowerlinePlanner, planned: PlannedProblem, radius: float,
                                                                       air: float) -> None:

@@ -24,6 +24,12 @@ def smootherstep(s: np.ndarray) -> np.ndarray:
     return rising
 
 
+def coasting(s: np.ndarray) -> np.ndarray:
+    """Quintic from 0 to 0 with slope one at the start, and zero curvature at both ends and slope at the other."""
+    moving: np.ndarray = s - 6 * s**3 + 8 * s**4 - 3 * s**5
+    return moving
+
+
 def turn_axis(b3_W: np.ndarray, s3_W: np.ndarray, via_W: np.ndarray) -> tuple[np.ndarray, float]:
     """Axis and angle that turn b3 into s3: the shortest way, or, where both are nearly opposite, the way through `via_W`.
 
@@ -130,7 +136,8 @@ def perch_guess(model: RotorModel, start: np.ndarray, p_end: np.ndarray, s3_W: n
 
 def recovery_guess(model: RotorModel, start: np.ndarray, p_end: np.ndarray, height_min: float, intervals: int,
                    duration: float = 1.2) -> tuple[np.ndarray, np.ndarray]:
-    """Initial guess of a recovery: away from the line along b3, with a drop while upside down, upright after 60 % of the time.
+    """Initial guess of a recovery: with the start's velocity at first, away from the line along b3, with a drop while upside down, upright
+    after 60 % of the time.
 
     Args and returns as `perch_guess`, with b3 = e3 at the end.
     """
@@ -140,7 +147,7 @@ def recovery_guess(model: RotorModel, start: np.ndarray, p_end: np.ndarray, heig
     way = p_end - start[:3]
     axis, angle = turn_axis(b3_W, E3, way)
     drop = 0.8 * angle / np.pi
-    states[:, :3] = start[:3] + smootherstep(s)[:, None] * (0.25 * way + 0.3 * b3_W - drop * E3)
+    states[:, :3] = start[:3] + smootherstep(s)[:, None] * (0.25 * way + 0.3 * b3_W - drop * E3) + coasting(s)[:, None] * duration * start[7:10]
     states[:, 2] = np.maximum(states[:, 2], height_min)
     states[:, 7:10] = np.gradient(states[:, :3], duration / intervals, axis=0)
     states[:, 3:7] = so3.quat_multiply(so3.quat_exp(smootherstep(s / 0.6)[:, None] * angle * axis), start[3:7])
