@@ -9,6 +9,7 @@ import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from importlib.util import find_spec
 
 import exact_sturm
 import numpy as np
@@ -54,6 +55,25 @@ def _plan_times(waypoints: int, settings: PerchSettings, count: int) -> tuple[np
             refused += 1
     wall, cpu = np.array(times).T
     return wall, cpu, refused
+
+
+def _rotorpy_times(waypoints: int, count: int) -> tuple[np.ndarray, int]:
+    """Return wall-clock times of RotorPy's minimum-snap trajectories through the same points [ms], and how many it did not find.
+
+    It plans x, y, z and yaw as QPs with durations for 1 m/s and a speed limit in the middle of each segment; attitude at the end,
+    thrust, rotors and clearance are not planned and not checked.
+    """
+    from rotorpy.trajectories.minsnap import MinSnap  # type: ignore[import-not-found,import-untyped]
+    times, failed = [], 0
+    for seed in range(count):
+        points = paper_like_problem(np.random.default_rng(seed), waypoints).points
+        begin = time.perf_counter()
+        try:
+            MinSnap(points, verbose=False)
+            times.append(1e3 * (time.perf_counter() - begin))
+        except TypeError:  # its solver's answer was None
+            failed += 1
+    return np.array(times), failed
 
 
 def _additions() -> float:
@@ -110,6 +130,10 @@ def figures(quick: bool) -> list[Figure]:
         name = f"plan as shipped, {waypoints} waypoints"
         out += [figure(name, "ms", times, median), figure(f"{name}, p99", "ms", times, p99, "p99 <="),
                 figure(f"{name}, CPU time", "ms", cpu), figure(f"{name}: refused of {count}", "problems", [refused])]
+        if find_spec("rotorpy"):  # `.venv/bin/python -m pip install --no-deps rotorpy cvxopt`
+            times, failed = _rotorpy_times(waypoints, count)
+            out += [figure(f"RotorPy's MinSnap, {waypoints} waypoints, no limit of thrust", "ms", times),
+                    figure(f"RotorPy's MinSnap, {waypoints} waypoints: not solved of {count}", "problems", [failed])]
     _print_step("plans with OSQP")
     for waypoints in (0, 3):
         times, _, _ = _plan_times(waypoints, replace(shipped, solver="osqp"), count // 10)
