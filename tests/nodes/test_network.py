@@ -7,10 +7,12 @@ import os
 import socket
 import subprocess
 import sys
+from xml.etree import ElementTree
 
 import pytest
 from perch_core.errors import ConfigError
 from perch_eval.arguments import open_network
+from system.scripts import ROOT
 
 PEER = """
 import os, sys, time
@@ -50,6 +52,13 @@ def sockets(count: int, **variables: str) -> list[set[str]]:
 def test_processes_find_each_other_over_sockets_that_are_bound_to_loopback(ros_domain):
     for addresses in sockets(3):
         assert addresses == {"127.0.0.1"}
+
+
+def test_what_they_miss_of_each_other_at_the_start_comes_with_an_announcement_half_a_second_later():
+    """By default in 3 s: in every second start of a node on a busy machine."""
+    period = next(element for element in ElementTree.parse(ROOT / "config" / "fastdds.xml").iter() if element.tag.endswith("}leaseAnnouncement"))
+    seconds, nanoseconds = (int(element.text) for element in period)
+    assert 0 < 10**9 * seconds + nanoseconds <= 500_000_000
 
 
 def test_they_find_each_other_where_discovery_is_local_as_well(ros_domain):

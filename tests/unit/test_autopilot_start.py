@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -140,22 +141,49 @@ def torn(frame: bytes) -> bytes:
     return frame[:-1] + bytes((frame[-1] ^ 0x55,))
 
 
-@pytest.mark.parametrize("fault, words", [
-    ({"answers": {msp.FC_VERSION: bytes((26, 6, 0))}}, "the autopilot runs BTFL 26.6.0, not Betaflight (BTFL) 4.3 to 4.6"),
-    ({"answers": {msp.FC_VARIANT: b"INAV"}}, "the autopilot runs INAV 4.6.0"),
-    ({"answers": {}}, "no autopilot answers within 2 s"),
-    ({"answers": {}, "noise": b"\x00\xf8\x06\x9e" * 9}, "bytes received that are not MSP: is the baud rate right"),
-    ({"spoil": torn}, "bytes received that are not MSP: is the baud rate right"),
-    ({"answers": {msp.STATUS: status(1 << 23)}}, "the autopilot refuses to arm: accelerometer is not calibrated: calibrate it"),
-    ({"answers": {msp.ANALOG: analog(12.1)}}, "the battery has 12.1 V: the thrust curve of"),
-], ids=["another version", "another firmware", "silence", "another baud rate", "torn frames only", "a lasting refusal", "another battery"])
-def test_a_fault_at_the_start_is_one_line_and_exit_code_2_and_motors_stay_off(fault, words, peer, tmp_path):
-    file = tmp_path / "mine.yaml"
+@contextmanager
+def all_started(node: str, peers: dict[str, Peer], **parameters: str) -> Iterator[dict[str, tuple[subprocess.Popen, Peer]]]:
+    """A process for each peer, all at once, as a start with a fault waits for seconds."""
+    with reserved_domain() as number, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(number))
+        processes = {name: started(node, link=peer.link, **parameters) for name, peer in peers.items()}
+        try:
+            yield {name: (process, peers[name]) for name, process in processes.items()}
+        finally:
+            for name, process in processes.items():
+                process.kill(), process.communicate()
+                peers[name].close()
+
+
+AT_START = {
+    "another version": ({"answers": {msp.FC_VERSION: bytes((26, 6, 0))}}, "the autopilot runs BTFL 26.6.0, not Betaflight (BTFL) 4.3 to 4.6"),
+    "another firmware": ({"answers": {msp.FC_VARIANT: b"INAV"}}, "the autopilot runs INAV 4.6.0"),
+    "silence": ({"answers": {}}, "no autopilot answers within 2 s"),
+    "another baud rate": ({"answers": {}, "noise": b"\x00\xf8\x06\x9e" * 9}, "bytes received that are not MSP: is the baud rate right"),
+    "torn frames only": ({"spoil": torn}, "bytes received that are not MSP: is the baud rate right"),
+    "a lasting refusal": ({"answers": {msp.STATUS: status(1 << 23)}}, "the autopilot refuses to arm: accelerometer is not calibrated: calibrate it"),
+    "another battery": ({"answers": {msp.ANALOG: analog(12.1)}}, "the battery has 12.1 V: the thrust curve of"),
+}
+
+
+@pytest.fixture(scope="module")
+def betaflights(tmp_path_factory) -> Iterator[dict[str, tuple[subprocess.Popen, Peer]]]:
+    """A node for each fault of `AT_START`."""
+    file, peers = tmp_path_factory.mktemp("faults") / "mine.yaml", {}
     file.write_text(CURVE)
-    given = fault.get("answers")
-    peer.answers = {} if given == {} else peer.answers | (given or {})
-    peer.spoil, peer.noise = fault.get("spoil", peer.spoil), fault.get("noise", b"")
-    refused(started("betaflight", link=peer.link, vehicle=str(file)), words)
+    for name, (fault, _) in AT_START.items():
+        peers[name] = peer = Peer()
+        given = fault.get("answers")
+        peer.answers = {} if given == {} else peer.answers | (given or {})
+        peer.spoil, peer.noise = fault.get("spoil", peer.spoil), fault.get("noise", b"")
+    with all_started("betaflight", peers, vehicle=str(file)) as processes:
+        yield processes
+
+
+@pytest.mark.parametrize("name", AT_START)
+def test_a_fault_at_the_start_is_one_line_and_exit_code_2_and_motors_stay_off(name, betaflights):
+    process, peer = betaflights[name]
+    refused(process, AT_START[name][1])
     assert peer.switches == set()
 
 
@@ -200,16 +228,29 @@ def heartbeat(autopilot: int) -> bytes:
         common.MAVLink(None, srcSystem=1, srcComponent=1))
 
 
-@pytest.mark.parametrize("noise, words", [
-    (lambda: b"", "no heartbeat of the autopilot: check its power, link and system id"),
-    (lambda: b"\x00\xf8\x06\x9e" * 9, "corrupt frames: is the baud rate right?"),
-    (lambda: torn(heartbeat(12)), "corrupt frames: is the baud rate right?"),
-    (lambda: heartbeat(8), "the autopilot is of MAVLink's type 8, not PX4 (12) or ArduPilot (3)"),
-], ids=["silence", "another baud rate", "torn frames only", "another autopilot"])
-def test_a_mavlink_autopilot_that_is_none_is_one_line_and_exit_code_2(noise, words, peer):
-    heartbeat(12)
-    peer.noise = noise()
-    refused(started("mavlink", link=peer.link), words)
+MAVLINK_AT_START = {
+    "silence": (lambda: b"", "no heartbeat of the autopilot: check its power, link and system id"),
+    "another baud rate": (lambda: b"\x00\xf8\x06\x9e" * 9, "corrupt frames: is the baud rate right?"),
+    "torn frames only": (lambda: torn(heartbeat(12)), "corrupt frames: is the baud rate right?"),
+    "another autopilot": (lambda: heartbeat(8), "the autopilot is of MAVLink's type 8, not PX4 (12) or ArduPilot (3)"),
+}
+
+
+@pytest.fixture(scope="module")
+def mavlinks() -> Iterator[dict[str, tuple[subprocess.Popen, Peer]]]:
+    """A node for each fault of `MAVLINK_AT_START`."""
+    noises = {name: noise() for name, (noise, _) in MAVLINK_AT_START.items()}
+    peers = {name: Peer() for name in noises}
+    for name, noise in noises.items():
+        peers[name].noise = noise
+    with all_started("mavlink", peers) as processes:
+        yield processes
+
+
+@pytest.mark.parametrize("name", MAVLINK_AT_START)
+def test_a_mavlink_autopilot_that_is_none_is_one_line_and_exit_code_2(name, mavlinks):
+    process, peer = mavlinks[name]
+    refused(process, MAVLINK_AT_START[name][1])
     assert peer.heard == b""
 
 

@@ -87,6 +87,8 @@ EDITS = (  # file, what stands there (a regular expression), what shall stand th
 """),
     # it has a barometer only where its configuration says so: arming waits for its calibration, ten seconds and more
     ("main/sensors/barometer.c", r"(?<=baroDetect\(&baro\.dev, )BARO_VIRTUAL(?=\);)", "barometerConfig()->baro_hardware"),
+    # what it writes to its TCP port leaves when the library has waited for what arrives: for a millisecond instead of ten
+    (_SITL, r"dyad_setUpdateTimeout\(0.01f\)", "dyad_setUpdateTimeout(0.001f)"),
     # two threads use the library of its TCP port, which is made for one: without a lock the one may free the port that the other is about
     # to open (it then accepts nobody, in 1 of 30 starts), and both write to one buffer
     (_DYAD, r"(?=static void destroyClosedStreams\(void\) \{)",
