@@ -1,5 +1,7 @@
 """Rest in any attitude with no word from VIO: the covariance is bounded and honest, the biases are followed, a departure is noticed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from perch_core import so3
@@ -150,6 +152,15 @@ def test_a_vehicle_that_has_flown_may_hover_where_its_imu_is_quiet():
     """The noise of the sensor file includes the vibration of flight."""
     found, _ = flown_without_vio(1.0, np.eye(3), vibration=0.335)
     assert np.sqrt(np.diag(found.P)[3:6]).min() > 0.02
+
+
+@pytest.mark.parametrize("coasting_after", [0.001, 0.05, 0.1, 0.15, 1.0])
+def test_rest_holds_for_any_age_that_counts_as_coasting(coasting_after):
+    resting = Resting()
+    resting.estimator.config = replace(CONFIG, coasting_after=coasting_after)
+    estimate = resting.run(3.0).estimator.estimate
+    assert estimate is not None and resting.estimator.status.broken == 0
+    assert np.sqrt(np.diag(estimate.P)[3:6]).max() < 0.02
 
 
 def test_a_pose_that_the_imu_history_does_not_reach_is_too_old():

@@ -221,7 +221,7 @@ class Estimator:
             return
         self._has_moved |= self._moves(self._live)
         belief, middle = self._base, now - round(0.5e9 * WINDOW)
-        if now - max(self._newest_vio_stamp, belief.stamp) < round(1e9 * config.coasting_after):
+        if belief.stamp >= middle or now - max(self._newest_vio_stamp, belief.stamp) < round(1e9 * config.coasting_after):
             return
         steps = window(self._imu, now)
         may_rest = self._resting or not self._has_moved or leans(steps)
