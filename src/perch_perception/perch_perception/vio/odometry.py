@@ -191,6 +191,7 @@ class VisualInertialOdometry:
         moved = self._last_pose.known_at is not None or (self.filter is not None and not rests)
         if rests:
             self._store_pose()
+            self._begin_motion_start()
             self.filter, self._at_rest = None, False
         elif self.filter is not None:
             self._drop_filter(_UNSEEN_SPEED if self._at_rest else 0.0)
@@ -243,17 +244,18 @@ class VisualInertialOdometry:
 
         With odometry, or after a loss in motion, it may hover, where for moments either looks like rest: the IMU must be quiet and
         the image static for long, or, without an image, the vehicle lean or be known to rest by the odometry. The biases of an
-        earlier filter do not count: they may be why it was lost.
+        earlier filter do not count: they may be why it was lost. Odometry that cannot be used leaves the configured start.
         """
-        for_long = self._recent_views.is_static(STATIC_DURATION)
-        if self._odometry or self._last_pose.known_at is not None:
-            known = for_long or (for_long is None and (self._odometry_rests or leans(steps)))
-            return bool(known) and is_at_rest(steps)
+        for_long, moving = self._recent_views.is_static(STATIC_DURATION), self._last_pose.known_at is not None
+        if moving or self._odometry:
+            unseen = for_long is None and (not moving or self._odometry_rests or leans(steps))
+            return bool(for_long or unseen) and is_at_rest(steps)
         return self._recent_views.is_static() is not False and is_at_rest(steps, image_is_static=bool(for_long))
 
     def _take_odometry(self, exposure: int) -> None:
         """Make the newest odometry before an exposure the known pose."""
         odometry = next((o for o in reversed(self._odometry or ()) if self._imu.oldest <= o.stamp < exposure), None)
+        self._odometry_rests = False
         if odometry is None:
             return
         pose = pose_of(odometry)
@@ -268,7 +270,7 @@ class VisualInertialOdometry:
         self._last_pose.propagate_position(state, self._imu)
         self.filter = Msckf(self.config, state, self.mount.camera.fx)
         self._last_update = state.stamp
-        self._odometry = None
+        self._odometry, self._odometry_rests = None, False
         self._observation_counts.clear()
 
     # -- afterwards --------------------------------------------------------------------------------------------------
@@ -290,8 +292,8 @@ class VisualInertialOdometry:
         """Whether the vehicle rests: the IMU is quiet, nothing moves in the image, and the filter's velocity may be zero.
 
         False until `_MAX_BLIND_NO_TRACKS` after a visual update: a very quiet hover looks like rest. After a flight, a rest begins only
-        with evidence beyond the IMU: an image that is static for long, a lean, or the height of standing on the floor. Where IMU samples are missing, a vehicle that rested
-        before rests still if the images since have not moved.
+        with evidence beyond the IMU: an image that is static for long, a lean, or the height of standing on the floor. Where IMU
+        samples are missing, a vehicle that rested before rests still if the images since have not moved.
         """
         if self._last_visual_update is not None and exposure - self._last_visual_update < round(1e9 * _MAX_BLIND_NO_TRACKS):
             return False
