@@ -123,6 +123,18 @@ def test_the_average_of_an_image_is_taken_once_it_is_good():
     assert [one.found for one in bench.out["sighting"]] == [True] * 4 and len(bench.out["pose"]) == 1
 
 
+@pytest.mark.parametrize("given", [{"twist_covariance": np.zeros((6, 6))}, {"twist_covariance": -np.eye(6)}])
+def test_the_motion_of_odometry_without_a_twist_is_no_jump(given):
+    """A turn by 1 rad/s at 3 m/s; motion capture often gives poses alone."""
+    bench = Bench()
+    for ms in range(0, 1000, 2):
+        q = (0.0, 0.0, math.sin(0.0005 * ms), math.cos(0.0005 * ms))
+        bench.component.on_odometry(odometry(ms * MS, p_WB=(0.003 * ms, 0.0, 1.0), q_WB=q, v_B=(0.0, 0.0, 0.0), **given))
+    body = bench.component.bodies.at(0.95)
+    assert body.v_WB == pytest.approx([3.0, 0.0, 0.0]) and body.w_WB_B == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
+    assert body.corrected == pytest.approx(np.zeros(3), abs=0.01)
+
+
 def test_the_queue_is_bounded():
     bench = Bench()
     for k in range(MAX_QUEUED + 5):

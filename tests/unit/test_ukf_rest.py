@@ -1,5 +1,7 @@
 """Rest in any attitude with no word from VIO: the covariance is bounded and honest, the biases are followed, a departure is noticed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from perch_core import so3
@@ -120,21 +122,45 @@ def test_rest_is_in_the_variance_whatever_the_biases(rate, turn):
     assert all(seen)
 
 
-@pytest.mark.parametrize("coasting", [0.6, 1.0, 2.5])
-def test_a_flight_without_vio_before_the_rest_is_not_left_out(coasting):
-    """At 1 m/s, then it brakes and rests. The IMU that is kept is shorter than the flight."""
+def flown_without_vio(coasting, R_WB, vibration):
+    """At 1 m/s, then it brakes and is still; VIO ends before. `vibration`: of the accelerometer in flight [m/s^2].
+
+    Returns:
+        The estimate, and the position along x.
+    """
     rng, estimator, p, v = np.random.default_rng(0), Estimator(CONFIG), 0.0, 0.0
     for k in range(1, round(500 * (2.0 + coasting))):
         t = 0.002 * k
         a = 2.5 if 0.3 < t <= 0.7 else -5.0 if 1.0 + coasting < t <= 1.2 + coasting else 0.0
         p, v = p + 0.002 * v + 0.5 * a * 0.002**2, v + 0.002 * a
-        shaken = 1.0 if 0.3 < t <= 1.2 + coasting else 0.335
-        estimator.add_imu(ImuSample(2_000_000 * k, tuple(rng.normal(0.0, 0.011, 3)), tuple(rng.normal([a, 0.0, 9.81], shaken))))
+        shaken = vibration if 0.3 < t <= 1.2 + coasting else 0.335
+        estimator.add_imu(ImuSample(2_000_000 * k, tuple(rng.normal(0.0, 0.011, 3)), tuple(rng.normal(R_WB.T @ [a, 0.0, 9.81], shaken))))
         if t <= 1.0 and k > 100 and k % 16 == 0:
-            estimator.add_vio(VioPose(2_000_000 * k, np.array([p, 0.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), 1e-5 * np.eye(6),
-                                      np.array([v, 0.0, 0.0]), 1e-4 * np.eye(3)))
-    found = estimator.estimate
+            estimator.add_vio(VioPose(2_000_000 * k, np.array([p, 0.0, 1.0]), so3.quat_from_matrix(R_WB), 1e-5 * np.eye(6),
+                                      R_WB.T @ [v, 0.0, 0.0], 1e-4 * np.eye(3)))
+    return estimator.estimate, p
+
+
+@pytest.mark.parametrize("coasting", [0.6, 1.0, 2.5])
+def test_a_flight_without_vio_before_the_rest_is_not_left_out(coasting):
+    """The IMU that is kept is shorter than the flight, which ends on a wall."""
+    found, p = flown_without_vio(coasting, so3.exp(ATTITUDES["wall"]), vibration=1.0)
     assert abs(found.v_WB[0]) < 0.01 and abs(found.p_WB[0] - p) < 3.0 * np.sqrt(found.P[0, 0])
+
+
+def test_a_vehicle_that_has_flown_may_hover_where_its_imu_is_quiet():
+    """The noise of the sensor file includes the vibration of flight."""
+    found, _ = flown_without_vio(1.0, np.eye(3), vibration=0.335)
+    assert np.sqrt(np.diag(found.P)[3:6]).min() > 0.02
+
+
+@pytest.mark.parametrize("coasting_after", [0.001, 0.05, 0.1, 0.15, 1.0])
+def test_rest_holds_for_any_age_that_counts_as_coasting(coasting_after):
+    resting = Resting()
+    resting.estimator.config = replace(CONFIG, coasting_after=coasting_after)
+    estimate = resting.run(3.0).estimator.estimate
+    assert estimate is not None and resting.estimator.status.broken == 0
+    assert np.sqrt(np.diag(estimate.P)[3:6]).max() < 0.02
 
 
 def test_a_pose_that_the_imu_history_does_not_reach_is_too_old():

@@ -137,6 +137,26 @@ def test_a_blurred_patch_is_known_less_well_than_a_sharp_one(monkeypatch):
     assert median[0] == 1.0 < median[1]
 
 
+@pytest.mark.parametrize("level", [-20.0, 275.0, 128.0])
+def test_where_most_pixels_are_black_or_white_the_noise_is_that_of_the_others(level):
+    rng = np.random.default_rng(6)
+    scene = np.full((480, 640), level) + np.linspace(-1.0, 1.0, 640) * (150.0 if level != 128.0 else 0.0)
+    clipped = np.clip(np.rint(scene + rng.normal(0.0, 3.0, scene.shape)), 0, 255).astype(np.uint8)
+    assert _noise(clipped) == pytest.approx(3.0, rel=0.15)
+    assert _noise(tracking.flattened(clipped), clipped) == pytest.approx(3.0, rel=0.15)
+
+
+@pytest.mark.parametrize("level", [0, 110, 255])
+def test_an_image_without_noise_has_that_of_its_rounding(level):
+    """Synthetic, compressed, or saturated: no feature is exact."""
+    camera, image = VEHICLE.mounts["down"].camera, np.full((480, 640), level, np.uint8)
+    assert _noise(image) == pytest.approx(np.sqrt(1.0 / 12.0))
+    for x in range(60, 600, 60):
+        cv2.rectangle(image, (x, 200), (x + 30, 230), 200 if level < 200 else 50, -1)
+    features = Tracker(VioConfig().tracker, camera).track(image, np.eye(3))
+    assert len(features.ids) > 10 and features.sigma.min() > 1e-4
+
+
 # -- the whole perch -----------------------------------------------------------------------------------------------------
 
 

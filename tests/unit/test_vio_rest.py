@@ -20,6 +20,13 @@ def blank(rng, level=110, noise=4):
     return lambda frame: some[frame % 4]
 
 
+def textured(rng, noise=2.0):
+    """The same, of a floor that is seen."""
+    texture = cv2.GaussianBlur(rng.normal(128, 200, (480, 640)), (0, 0), 3.0)
+    some = [np.clip(texture + rng.normal(0.0, noise, texture.shape), 0, 255).astype(np.uint8) for _ in range(4)]
+    return lambda frame: some[frame % 4]
+
+
 def outcomes(climb, drop, until=2.6):
     """Frames over a blank floor: rest for 1 s, `climb` and `drop` [m/s^2] for 0.1 s each, then nothing more; (time, outcome, height)."""
     rng, mount = np.random.default_rng(1), load_vehicle("snapdragon").mounts["down"]
@@ -54,9 +61,13 @@ def test_a_steady_climb_is_not_rest():
 @pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["never", "before", "meanwhile"])
 def test_a_camera_that_was_silent_for_longer_than_the_imu_is_kept_is_used_again(leaves):
-    """At rest it rests where it did. Where it moved when the images stopped or come back, position and heading are as uncertain as they then are."""
+    """At rest it rests where it did. Where it moved when the images stopped or come back, position and heading are as uncertain as they then are.
+
+    Only a floor that is seen shows that a vehicle that has moved rests again.
+    """
     rng, mount, frame = np.random.default_rng(1), load_vehicle("snapdragon").mounts["down"], 0.1
     vio, seen, image = VisualInertialOdometry(VioConfig(), mount, np.array([0.5, 0.2, 1.0])), [], blank(rng)
+    lit = textured(rng)
     for k in range(5500):
         t = 0.002 * k
         begin = {"never": np.inf, "before": 1.0, "meanwhile": 8.8}[leaves]
@@ -64,7 +75,8 @@ def test_a_camera_that_was_silent_for_longer_than_the_imu_is_kept_is_used_again(
         vio.add_imu(ImuSample(k * 2 * MS, tuple(rng.normal(0, 0.002, 3)), tuple(rng.normal(0, 0.05, 3) + [0, 0, up])))
         if t > frame + 0.02:
             if not 1.3 < frame < 9.0:
-                seen.append((frame, vio.add_image(round(frame * 1e9), image(len(seen)))))
+                floor = image if frame < 9.0 or leaves == "never" else lit
+                seen.append((frame, vio.add_image(round(frame * 1e9), floor(len(seen)))))
             frame += 1 / 30
     before, after = (next(r for t, r in reversed(seen) if t < 1.0), seen[-1][1])
     assert before.outcome is FrameOutcome.RESTING is after.outcome, after.message

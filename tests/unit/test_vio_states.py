@@ -207,14 +207,48 @@ def test_an_unknown_heading_does_not_end_the_filter():
     assert divergence(state, 20, 0, 15) == ""
 
 
-def after_loss(change=lambda state: None, drift=0.0, shake=1.0, image=BLANK):
+SEEN, DARK = np.random.default_rng(5).uniform([40, 40], [600, 440], (60, 2)), np.zeros((0, 2))
+
+
+def unaccelerated(pixels, drift=0.0, R_WB=np.eye(3), has_flown=True, height=0.3):
+    """Outcomes of 1.2 s of a vehicle without acceleration, whose tracks, at these pixels, drift [px/s].
+
+    Its filter has had no vision for half a second, with a velocity of 12 +- 3 cm/s, at a height above where it started; or, has it not
+    flown, it starts there.
+    """
+    rng, vio, out, frame = np.random.default_rng(3), VisualInertialOdometry(VioConfig(), MOUNT, floor=-0.04), [], 0.3
+    vio.tracker = GivenTracks(lambda: (np.arange(len(pixels)), pixels + [drift * frame, 0.0]))
+    noise = np.repeat([vio.config.imu.gyro_noise_density, vio.config.imu.accel_noise_density], 3) / np.sqrt(0.002)
+    for k in range(750):
+        read = noise * rng.normal(size=6) + np.r_[np.zeros(3), R_WB.T @ [0.0, 0.0, GRAVITY]]
+        vio.add_imu(ImuSample(2_000_000 * k, tuple(read[:3]), tuple(read[3:])))
+        if k == 140 and has_flown:
+            pose, v_WB = configured_pose(np.array([0.0, 0.0, height]), 0.0), np.array([0.12, 0.0, 0.0])
+            vio._begin(initial_state(vio.config, MOUNT, 280_000_000, R_WB, pose, v_WB, np.zeros(3), 0.005, 0.03, 0.001))
+            vio._last_visual_update = 0
+        if 0.002 * k > frame + 0.02:
+            out.append(vio.add_image(round((frame + MOUNT.stamp_offset) * 1e9), BLANK).outcome)
+            frame += 1 / 30
+    return out
+
+
+@pytest.mark.parametrize("rests, pixels, case", [
+    (False, DARK, {}), (True, DARK, dict(R_WB=so3.exp(np.array([0.0, 1.4, 0.0])))), (True, DARK, dict(has_flown=False)),
+    (True, DARK, dict(height=0.0)), (False, SEEN, dict(drift=2.5)), (True, SEEN, {})],
+    ids=["dark", "on a wall", "not flown", "on the floor", "static for a moment", "static"])
+def test_a_quiet_imu_is_no_rest_where_it_may_be_a_hover(rests, pixels, case):
+    """The noise of the sensor file includes the vibration of flight: a smooth hover is as quiet. None is on its nose."""
+    assert (FrameOutcome.RESTING in unaccelerated(pixels, **case)) is rests
+
+
+def after_loss(change=lambda state: None, drift=0.0, shake=1.0, image=BLANK, count=60):
     """Results of 1.2 s after a loss in a hover of a filter whose state was changed; the IMU is quiet but for `shake` times its noise.
 
     The view drifts by `drift` [px/s].
     """
     rng, vio, out, frame = np.random.default_rng(3), VisualInertialOdometry(VioConfig(), MOUNT), [], 0.3
-    pixels, imu = rng.uniform([40, 40], [600, 440], (60, 2)), VioConfig().imu
-    vio.tracker = GivenTracks(lambda: (np.arange(60), pixels + [drift * frame, 0.0]))
+    pixels, imu = rng.uniform([40, 40], [600, 440], (60, 2))[:count], VioConfig().imu
+    vio.tracker = GivenTracks(lambda: (np.arange(count), pixels + [drift * frame, 0.0]))
     noise = shake * np.repeat([imu.gyro_noise_density, imu.accel_noise_density], 3) / np.sqrt(0.002)
     for k in range(750):
         read = noise * rng.normal(size=6) + [0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY]
@@ -228,6 +262,10 @@ def after_loss(change=lambda state: None, drift=0.0, shake=1.0, image=BLANK):
             out.append(vio.add_image(round((frame + MOUNT.stamp_offset) * 1e9), image))
             frame += 1 / 30
     return vio, out
+
+
+def test_a_filter_lost_in_a_hover_in_the_dark_does_not_start_at_rest():
+    assert all(result.estimate is None for result in after_loss(count=0)[1])
 
 
 @pytest.mark.parametrize("drift, shake, rests", [(0.0, 1.0, True), (0.8, 5.0, False)])

@@ -205,8 +205,9 @@ class PosedCameraComponent(CameraComponent[C]):
         if verdict is StampVerdict.RESTARTED:
             self.warn(f"odometry: stamp jump to {state.stamp} ns: restarting")
             self.restart()
-        self.bodies.add(BodyState(seconds(state.stamp), np.array(state.p_WB), np.array(state.q_WB), np.array(state.v_WB),
-                                  np.array(state.w_B), state.pose_covariance))
+        body = BodyState(seconds(state.stamp), np.array(state.p_WB), np.array(state.q_WB), np.array(state.v_WB), np.array(state.w_B),
+                         state.pose_covariance)
+        self.bodies.add(body if state.has_twist else self.bodies.with_twist(body))
         if self._queue:
             self.advance()
 

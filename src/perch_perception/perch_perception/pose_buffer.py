@@ -92,6 +92,18 @@ class PoseBuffer:
             self._corrected.popleft()
         return True
 
+    def with_twist(self, state: BodyState) -> BodyState:
+        """Return a state of a source that has no twist with that of its pose's change since the newest; zero before the second.
+
+        Jumps of such a source count as motion.
+        """
+        dt = state.time - self.newest
+        if not 0.0 < dt < np.inf:
+            return state
+        before = self._states[-1]
+        turn = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(before.q_WB), state.q_WB))
+        return replace(state, v_WB=(state.p_WB - before.p_WB) / dt, w_WB_B=turn / dt)
+
     def at(self, time: float) -> BodyState:
         """Return the state at a time [s].
 

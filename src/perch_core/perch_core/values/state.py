@@ -40,6 +40,12 @@ class OdometryState(NamedTuple):
     frame: str = "map"
 
     @property
+    def has_twist(self) -> bool:
+        """Whether there is a velocity: `twist_covariance`[0, 0] is not negative, nor are velocity and covariance all zero."""
+        twist = np.asarray(self.twist_covariance, dtype=float)
+        return bool(twist[0, 0] >= 0.0 and (np.any(self.v_B) or twist.any()))
+
+    @property
     def v_WB(self) -> Floats:
         """Velocity in W [m/s], 3 floats."""
         return rotated(self.q_WB, self.v_B, 1.0)

@@ -227,8 +227,8 @@ class LineMapper:
     def _covariance(self, estimate: WireEstimate, s: float) -> np.ndarray:
         """Return the covariance of the point at s relative to the vehicle, from sightings and attitude, shape (3, 3) [m^2].
 
-        The sightings' part includes the camera's mount, which the fit estimates. The odometry's position is excluded: its drift
-        moves vehicle and wires together.
+        The sightings' part includes the camera's mount, which the fit estimates, and the odometry's drift between them. The drift
+        since the last sighting of a wire out of view is excluded: its position is that relative to the vehicle when it was last seen.
         """
         assert self._body is not None  # it was seen from somewhere
         lever = so3.hat(estimate.curve.at(s) - self._body.p_WB)

@@ -20,12 +20,13 @@ from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.ukf.measurement import Estimate, Health, Status, VioOutcome, VioPose
 from perch_perception.ukf.rest import after_rest, after_stop
-from perch_perception.ukf.stillness import WINDOW, is_at_rest, window
+from perch_perception.ukf.stillness import WINDOW, is_at_rest, leans, window
 from perch_perception.ukf.unscented import GATES, Belief, CovarianceError, Innovation, UnscentedTransform
 
 _HISTORY = 0.5  # IMU kept for replay: VIO is late by 0.04 s, by 0.08 s in the campaign on robustness [s]
 _MAX_CONSECUTIVE_REJECTIONS = 15  # rejections in a row after which VIO is taken to have jumped
 _UNTRUSTED_VELOCITIES = 30  # after a start or a jump, only the pose of so many measurements is used, which shows whether their velocity fits
+_MOVING = 0.1  # speed of a vehicle that certainly moves, if it is known that well [m/s]
 _LOST_POSITION = 2.0  # 1 sigma beyond which the state is not to be used [m]
 _LOST_ATTITUDE = 0.6  # the same [rad]
 COVARIANCE_STRIDE = 5  # IMU steps per update of the published covariance
@@ -46,7 +47,7 @@ class Estimator:
         self._imu = ImuBuffer(config.imu, _HISTORY)
         self._base: Belief | None = None  # at the stamp of the last applied pose, or of rest
         self._newest_vio_stamp = self._applied = 0   # newest stamp of any pose, and of an applied one [ns]
-        self._resting = False             # the base is one of rest
+        self._resting = self._has_moved = False  # the base is one of rest; the vehicle has moved since the first pose
         self._live: Belief | None = None  # covariance up to a few steps ago
         self._anchors: list[Belief] = []  # where a replay can begin: the base and, without VIO for long, later beliefs
         self._x = np.zeros(at.NOMINAL_SIZE)  # nominal state now
@@ -212,16 +213,21 @@ class Estimator:
     def _rest(self) -> None:
         """Without VIO poses, apply rest up to the middle of the window where the vehicle rests; a departure may just have begun.
 
-        Skipped while VIO poses arrive: VIO applies rest itself, or measures the pose at rest.
+        Skipped while VIO poses arrive: VIO applies rest itself, or measures the pose at rest. A vehicle that has moved may hover as
+        quietly as it would rest: then only a lean shows rest.
         """
         now, config = self._imu.newest.stamp, self.config
-        if self._base is None or self._live is None or now - max(self._newest_vio_stamp, self._base.stamp) < round(
-                1e9 * config.coasting_after):
+        if self._base is None or self._live is None:
             return
-        if not is_at_rest(window(self._imu, now), self._base.x[10:16], np.diag(self._live.P)[9:15]):
+        self._has_moved |= self._moves(self._live)
+        belief, middle = self._base, now - round(0.5e9 * WINDOW)
+        if belief.stamp >= middle or now - max(self._newest_vio_stamp, belief.stamp) < round(1e9 * config.coasting_after):
+            return
+        steps = window(self._imu, now)
+        may_rest = self._resting or not self._has_moved or leans(steps)
+        if not may_rest or not is_at_rest(steps, belief.x[10:16], np.diag(self._live.P)[9:15]):
             self._resting = False
             return
-        belief, middle = self._base, now - round(0.5e9 * WINDOW)
         try:
             if not self._resting:
                 begin = max(belief.stamp, 2 * middle - now)
@@ -236,6 +242,12 @@ class Estimator:
             self._set_base(after_rest(belief, self._imu.run(belief.stamp, middle), middle, config))
         except CovarianceError as error:
             self._diverge(str(error))
+
+    @staticmethod
+    def _moves(belief: Belief) -> bool:
+        """Whether the speed certainly exceeds rest: it is above `_MOVING`, and by six sigma above zero."""
+        speed = float(np.linalg.norm(belief.x[at.VELOCITY]))
+        return speed > _MOVING and speed > 6.0 * float(np.sqrt(np.diag(belief.P)[at.D_VELOCITY].max()))
 
     def _refresh(self) -> None:
         """Propagate the published covariance to the newest IMU stamp, and keep anchors for a replay of the IMU history."""

@@ -64,7 +64,7 @@ def pose_of(odometry: OdometryState) -> VioPose:
     """
     p, q, v_B, _ = (_numbers(x, n) for x, n in ((odometry.p_WB, 3), (odometry.q_WB, 4), (odometry.v_B, 3), (odometry.w_B, 3)))
     covariance, twist = _numbers(odometry.pose_covariance, 6, 6), _numbers(odometry.twist_covariance, 6, 6)
-    if twist[0, 0] < 0.0 or not (v_B.any() or twist.any()):  # there is no velocity
+    if not odometry.has_twist:
         return VioPose(odometry.stamp, p, q, covariance)
     # all zero: its covariance is not given
     return VioPose(odometry.stamp, p, q, covariance, v_B, twist[:3, :3] if twist[0, 0] > 0.0 else None)

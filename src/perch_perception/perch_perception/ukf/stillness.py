@@ -10,7 +10,8 @@ from the uncertainty of the biases and from the scatter of the readings. Where n
 turn-on biases are assumed.
 
 The test works in any attitude and requires neither images nor the controller's state. It cannot distinguish constant motion from
-rest: before a zero-velocity update, the caller checks that the estimated velocity allows it (`ukf.rest`, `vio.rest`).
+rest, nor a hover whose vibration is within the sensor file's noise. After a motion the caller therefore requires that the velocity
+may be zero (`ukf.rest`, `vio.rest`), and evidence beyond a quiet IMU, e.g. a static image or a lean (docs/estimation.md).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ _MIN_SAMPLES = 10
 _MIN_COVERAGE = 0.9   # share of the window that the samples must span
 _LAST_PART = 4        # part of the window, its last, that must look like rest as well: a departure has just begun
 _MEAN_GATE = 6.0      # sigma up to which a mean counts as zero
+_HOVER_COSINE = 0.866  # of 30 deg, the largest tilt of a vehicle that its rotors hold still in the wind
 
 
 def energy(steps: np.ndarray) -> float:
@@ -61,6 +63,15 @@ def is_at_rest(steps: np.ndarray, biases: np.ndarray | None = None, variance: np
     if (image_is_static or biases is None) and (off > _MEAN_GATE * spread / np.sqrt(len(steps))).any():
         return False
     return bool((_excess_means(latest, biases, known) < _MEAN_GATE * spread / np.sqrt(len(latest))).all())
+
+
+def leans(steps: np.ndarray) -> bool:
+    """Whether the mean specific force over IMU steps (m, 9) is farther off b3 than rotors can hold a vehicle still.
+
+    Their thrust is along b3: a vehicle that is at rest with another direction upwards is held by a surface or a wire.
+    """
+    f = steps[:, ACCEL].mean(axis=0)
+    return bool(f[2] < _HOVER_COSINE * np.linalg.norm(f))
 
 
 def _excess_means(steps: np.ndarray, biases: np.ndarray | None, known: np.ndarray) -> np.ndarray:

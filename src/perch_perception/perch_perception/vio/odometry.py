@@ -15,7 +15,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample, OdometryState
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, without_gaps
 from perch_perception.ukf.odometry import pose_of
-from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS, energy, is_at_rest, window
+from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS, energy, is_at_rest, leans, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
@@ -36,6 +36,7 @@ _MAX_BLIND_NO_TRACKS = 0.15  # longest time without a visual update where nothin
 _MAX_BLIND = 0.5  # the same while features are tracked [s]
 _MAX_BLIND_TAKE_OFF = 1.0  # the same at a take-off, from rest on [s]
 _MAX_TAKE_OFF_SIGMA = 0.05  # largest 1 sigma of the velocity in a blind take-off [m/s]
+_MAX_STANDING_SIGMA = 0.02  # largest 1 sigma of the height of a vehicle that is known to stand on the floor [m]
 _UNSEEN_SPEED = 1.0  # of a vehicle that left its place while there were no images [m/s]
 _DIVERGENCE_FRAMES = 15  # frames over which observations that are refused and used are counted
 _MAX_STAMP_LEAD = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
@@ -64,11 +65,12 @@ class VisualInertialOdometry:
         self.restarts = 0
         self._imu = ImuBuffer(config.imu, 2.0 + motion_start.DURATION)
         self._last_pose = LastPose(start.configured_pose(p_WB, yaw))
-        self._floor = floor
+        self._floor, self._standing_height = floor, float(p_WB[2])  # in W
         self._views: deque[tuple[int, Features]] = deque()  # (exposure, features) at rest, not passed by the filter
         self._recent_views = RecentViews()
         self._gyro_bias: np.ndarray | None = None  # of the last filter whose biases may be true
         self._odometry: deque[OdometryState] | None = deque(maxlen=_KEPT_ODOMETRY)  # of the estimator; None from the first start on
+        self._odometry_rests = False  # by the newest odometry, while it is used
         self._at_rest = False
         self._noise_factor = 1.0  # variance of the IMU at rest over that of the sensor's noise, as last measured
         self._at_configured_start = True  # the vehicle has not left the configured start
@@ -185,10 +187,14 @@ class VisualInertialOdometry:
 
         A vehicle that rested before the gap, and whose IMU is at rest after it, rests there still. Another may have turned by any angle.
         """
-        left = self._at_rest and not is_at_rest(window(self._imu, exposure))
-        moved = left or self._last_pose.known_at is not None or (self.filter is not None and not self._at_rest)
-        if self.filter is not None:
-            self._drop_filter(_UNSEEN_SPEED if left else 0.0)
+        rests = self._at_rest and is_at_rest(window(self._imu, exposure))
+        moved = self._last_pose.known_at is not None or (self.filter is not None and not rests)
+        if rests:
+            self._store_pose()
+            self._begin_motion_start()
+            self.filter, self._at_rest = None, False
+        elif self.filter is not None:
+            self._drop_filter(_UNSEEN_SPEED if self._at_rest else 0.0)
         if moved:
             self._last_pose.forget_heading()
         self.tracker.reset()
@@ -237,21 +243,25 @@ class VisualInertialOdometry:
         """Whether the last IMU steps (m, 9) and images are those of a vehicle at rest.
 
         With odometry, or after a loss in motion, it may hover, where for moments either looks like rest: the IMU must be quiet and
-        the image static for long. The biases of an earlier filter do not count: they may be why it was lost.
+        the image static for long, or, without an image, the vehicle lean or be known to rest by the odometry. The biases of an
+        earlier filter do not count: they may be why it was lost. Odometry that cannot be used leaves the configured start.
         """
-        for_long = self._recent_views.is_static(STATIC_DURATION)
-        if self._odometry or self._last_pose.known_at is not None:
-            return for_long is not False and is_at_rest(steps)
+        for_long, moving = self._recent_views.is_static(STATIC_DURATION), self._last_pose.known_at is not None
+        if moving or self._odometry:
+            unseen = for_long is None and (not moving or self._odometry_rests or leans(steps))
+            return bool(for_long or unseen) and is_at_rest(steps)
         return self._recent_views.is_static() is not False and is_at_rest(steps, image_is_static=bool(for_long))
 
     def _take_odometry(self, exposure: int) -> None:
         """Make the newest odometry before an exposure the known pose."""
         odometry = next((o for o in reversed(self._odometry or ()) if self._imu.oldest <= o.stamp < exposure), None)
+        self._odometry_rests = False
         if odometry is None:
             return
         pose = pose_of(odometry)
         if pose.problem() is None:
             self._last_pose.pose, self._at_configured_start = start.odometry_pose(pose), False
+            self._odometry_rests = start.is_known_to_rest(pose, self.config.imu)
             self._last_pose.known_at = pose.stamp, float(np.linalg.norm(odometry.v_B))
             self._last_pose.begin_rotation(self._motion_start.gyro_bias)
             self._last_pose.rotate(self._imu.run(pose.stamp, exposure))
@@ -260,7 +270,7 @@ class VisualInertialOdometry:
         self._last_pose.propagate_position(state, self._imu)
         self.filter = Msckf(self.config, state, self.mount.camera.fx)
         self._last_update = state.stamp
-        self._odometry = None
+        self._odometry, self._odometry_rests = None, False
         self._observation_counts.clear()
 
     # -- afterwards --------------------------------------------------------------------------------------------------
@@ -281,18 +291,31 @@ class VisualInertialOdometry:
     def _is_at_rest(self, exposure: int) -> bool:
         """Whether the vehicle rests: the IMU is quiet, nothing moves in the image, and the filter's velocity may be zero.
 
-        False until `_MAX_BLIND_NO_TRACKS` after a visual update: a very quiet hover looks like rest. Where IMU samples are missing, a
-        vehicle that rested before rests still if the images since have not moved.
+        False until `_MAX_BLIND_NO_TRACKS` after a visual update: a very quiet hover looks like rest. After a flight, a rest begins only
+        with evidence beyond the IMU: an image that is static for long, a lean, or the height of standing on the floor. Where IMU
+        samples are missing, a vehicle that rested before rests still if the images since have not moved.
         """
-        state = self._running.state
         if self._last_visual_update is not None and exposure - self._last_visual_update < round(1e9 * _MAX_BLIND_NO_TRACKS):
             return False
-        quiet, steps = self._recent_views.is_static(), window(self._imu, exposure)
+        state, steps = self._running.state, window(self._imu, exposure)
+        quiet, for_long = self._recent_views.is_static(), bool(self._recent_views.is_static(STATIC_DURATION))
         if self._at_rest and quiet and len(without_gaps(steps)) < len(steps):
-            return bool(self._recent_views.is_static(STATIC_DURATION))
-        return (quiet is not False and (self._at_rest or rest.velocity_may_be_zero(state))
-                and is_at_rest(steps, *_biases(state),
-                               image_is_static=bool(quiet) and (self._at_rest or bool(self._recent_views.is_static(STATIC_DURATION)))))
+            return for_long
+        evidence = for_long or leans(steps) or self._is_on_floor(state) or self._is_leaving(exposure)
+        if not self._at_rest and not (evidence and rest.velocity_may_be_zero(state)):
+            return False
+        return quiet is not False and is_at_rest(steps, *_biases(state), image_is_static=bool(quiet) and (self._at_rest or for_long))
+
+    def _is_on_floor(self, state: at.State) -> bool:
+        """Whether the height is that of standing on the level ground, by three sigma of a height that is known well."""
+        sigma = float(np.sqrt(np.abs(state.P[at.POSITION, at.POSITION][2, 2])))
+        return (self._floor is not None and sigma < _MAX_STANDING_SIGMA
+                and abs(float(state.p_WB[2]) - self._standing_height) < 3.0 * sigma)
+
+    def _is_leaving(self, exposure: int) -> bool:
+        """Whether the velocity is still known from the last rest: no visual update since, which was a moment ago."""
+        return (self._last_visual_update is None and (exposure - self._last_update) * 1e-9 < _MAX_BLIND_TAKE_OFF
+                and velocity_sigma(self._running.state) < _MAX_TAKE_OFF_SIGMA)
 
     def _hold(self, exposure: int, features: Features) -> VioResult:
         """Update the filter with rest, up to `_REST_DELAY` before the exposure.
@@ -347,8 +370,7 @@ class VisualInertialOdometry:
         outcome = FrameOutcome.TRACKING
         if blind > (_MAX_BLIND if len(features.ids) - features.new >= MIN_TRACKS else _MAX_BLIND_NO_TRACKS):
             # in the first decimetres the floor is a blur; the standstill's knowledge carries the vehicle over them
-            leaving = self._last_visual_update is None and blind < _MAX_BLIND_TAKE_OFF and velocity_sigma(s) < _MAX_TAKE_OFF_SIGMA
-            outcome = FrameOutcome.LEAVING if leaving else FrameOutcome.BLIND
+            outcome = FrameOutcome.LEAVING if self._is_leaving(exposure) else FrameOutcome.BLIND
         return self._result(outcome, features, report)
 
     def _lose(self, features: Features, why: str) -> VioResult:

@@ -48,15 +48,27 @@ _KLT_EIGENVALUE = 1024.0  # least eigenvalue of the mean of g g^T over a patch, 
 # unit white noise in OpenCV's gradients, [-1 0 1]/2 along an axis and [3 10 3]/16 across it: variance, and how much of it the least
 # eigenvalue scatters from patch to patch (measured in images of noise alone)
 _NOISE_GRADIENT, _NOISE_SCATTER = (0.5**2 + 0.5**2) * (3**2 + 10**2 + 3**2) / 16**2, 0.08
+_ROUNDING = 12**-0.5  # 1 sigma of the rounding to grey levels
 _FLAT_STEP, _MID_GREY = 8, 128.0  # the average is taken in an image of 1 / step the size
 
 
-def _noise(image: np.ndarray) -> float:
-    """Return 1 sigma of an image's white noise [grey levels], from second differences in some rows (Immerkaer 1996)."""
-    above, row, below = (image[k : image.shape[0] - 2 + k : 16].astype(np.int16) for k in range(3))
-    across = above - 2 * row + below
+def _noise(image: np.ndarray, original: np.ndarray | None = None) -> float:
+    """Return 1 sigma of an image's white noise [grey levels], from second differences in some rows (Immerkaer 1996).
+
+    Pixels that are clipped, in the image or in the camera's `original` of it, do not show the noise. Where all are, or where camera
+    or compression have smoothed the noise away, that of the rounding to grey levels is left.
+    """
+    rows = _three_rows(image).astype(np.int16)
+    across = rows[0] - 2 * rows[1] + rows[2]
     second = across[:, :-2] - 2 * across[:, 1:-1] + across[:, 2:]
-    return float(np.median(np.abs(second))) / (0.6745 * 6.0)
+    clipped = np.any([(part == 0) | (part == 255) for part in (rows, _three_rows(image if original is None else original))], axis=(0, 1))
+    shown = second[~(clipped[:, :-2] | clipped[:, 1:-1] | clipped[:, 2:])]
+    return max(float(np.median(np.abs(shown))) / (0.6745 * 6.0), _ROUNDING) if len(shown) else _ROUNDING
+
+
+def _three_rows(image: np.ndarray) -> np.ndarray:
+    """Return every sixteenth row of an image and the two below it, shape (3, n, width)."""
+    return np.array([image[k : image.shape[0] - 2 + k : 16] for k in range(3)])
 
 
 def flattened(image: np.ndarray) -> np.ndarray:
@@ -116,12 +128,12 @@ class Tracker:
             R_now_before: rotation of the camera from C of the previous frame into C of the new one, shape (3, 3).
             slack: bound of its error [rad].
         """
-        image = flattened(image)
+        original, image = image, flattened(image)
         if self._previous is not None and len(self._pixels):
             self._follow(self._previous, image, R_now_before, slack)
             self._return_to_reference(image)
             self._thin()
-        self._previous, noise = image, _noise(image)
+        self._previous, noise = image, _noise(image, original)
         new = 0
         if len(self._pixels) < self.config.features * _REFILL:
             new = self._refill(image, noise)
@@ -225,7 +237,7 @@ class Tracker:
         _, _, least = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
             image, image, self._pixels.reshape(-1, 1, 2), None, winSize=(_WINDOW,) * 2, maxLevel=0,
             flags=cv2.OPTFLOW_LK_GET_MIN_EIGENVALS)
-        of_noise = max(_NOISE_GRADIENT * noise**2, float(np.finfo(np.float32).tiny))
+        of_noise = _NOISE_GRADIENT * noise**2
         of_scene = _KLT_EIGENVALUE * least.ravel().astype(float) - of_noise
         return noise / np.sqrt(_WINDOW**2 * np.maximum(of_scene, _NOISE_SCATTER * of_noise))
 
