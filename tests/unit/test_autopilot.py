@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import select
@@ -620,6 +621,22 @@ def test_a_firmware_in_the_loop_that_ends_is_named_at_once():
             running.receive(60.0)
         with pytest.raises(firmware.FirmwareError, match="cannot be sent anything: Broken pipe"):
             running.send(b"#")
+
+
+def test_a_copy_of_the_firmwares_memory_that_breaks_off_leaves_no_file(tmp_path, monkeypatch):
+    def breaks_off(source, copy) -> None:
+        copy.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sitl, "Cli", lambda *_: SimpleNamespace(apply=lambda _: None, check=lambda _: None))
+    monkeypatch.setattr(sitl.Sitl, "_launch", lambda *_: None)
+    monkeypatch.setattr(sitl.shutil, "copyfile", breaks_off)
+    running = sitl.Sitl.__new__(sitl.Sitl)
+    running._program, running._configuration = tmp_path / "betaflight_sitl", Configuration("mine.txt", ())
+    running._running = SimpleNamespace(process=SimpleNamespace(wait=lambda _: 0), close=lambda: None)
+    with pytest.raises(OSError, match="No space left"):
+        running._configured(tmp_path / "draft")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_rates_of_another_type_are_refused():
