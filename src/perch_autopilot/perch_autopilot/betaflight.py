@@ -113,10 +113,6 @@ class Betaflight(Component[BetaflightParameters]):
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Send a command to the autopilot; it is in effect until the next one, or until it is stale."""
-        values = (*command.w_B, command.thrust)
-        if command.armed and not sum(value * value for value in values) < 1e8:
-            self.warn(f"rates_thrust_command: {values} is not finite, or too large: ignored", min_interval=1.0)
-            return
         self._arm_commanded, self._was_armed, self._stopped = command.armed, self._was_armed and command.armed, self._stopped and command.armed
         sticks = self._sticks.channels(command.w_B, command.thrust) if command.armed else CENTRED
         self._lifted = command.armed and (self._lifted or lifts(sticks, self._throttles()[0]))

@@ -128,9 +128,6 @@ class Mavlink(Component[MavlinkParameters]):
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Store a command, which each poll sends until it is stale."""
-        if command.armed and not sum(value * value for value in (*command.w_B, command.thrust)) < 1e8:
-            self.warn("rates_thrust_command: not finite, or too large: ignored", min_interval=1.0)
-            return
         self._command, self._command_time = command, self._now or 0
 
     def on_command(self, command: ControllerCommand) -> None:
