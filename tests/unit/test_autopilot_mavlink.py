@@ -22,6 +22,8 @@ def asked(machine: Offboard, seconds: float, start: float = 0.0, wanted: bool = 
     out = []
     for k in range(round(100 * seconds)):
         now = start + 0.01 * k
+        if streaming:
+            machine.arming.command(now, wanted)
         machine.heartbeat(now, machine.autopilot, ARMED * machine.armed, machine.mode if machine.following else 0)
         out.append(machine.next_request(now, wanted, streaming))
     return [request for request in out if request is not Request.NOTHING]
@@ -58,6 +60,46 @@ def test_who_disarms_the_autopilot_is_obeyed_until_the_commands_have_the_motors_
     assert asked(machine, 5.0, start=1.0) == []
     asked(machine, 0.1, start=6.0, wanted=False)
     assert asked(machine, 1.5, start=6.1)[0] is (Request.ARM if following else Request.MODE)
+
+
+def test_a_disarm_and_an_arm_between_two_heartbeats_arm():
+    """The last heartbeat before them has it armed: that the next one has not is by the command."""
+    machine = Offboard(autopilot=PX4, following=True)
+    machine.heartbeat(0.0, PX4, ARMED, OFFBOARD)
+    requests = []
+    for k in range(300):
+        now, wanted = 0.01 * k, not 110 <= k < 130
+        if k % 100 == 0:
+            machine.heartbeat(now, PX4, ARMED * (k < 200), OFFBOARD)
+        machine.arming.command(now, wanted)
+        requests.append((now, machine.next_request(now, wanted, True)))
+    assert [(pytest.approx(now), request) for now, request in requests if request is not Request.NOTHING] == [
+        (1.1, Request.DISARM), (2.1, Request.ARM)]
+
+
+@pytest.mark.parametrize("armed", [False, True])
+def test_a_node_that_is_started_arms_only_after_a_command_with_the_motors_off(armed):
+    """A KILL before its start is not known; what flies is flown on."""
+    autopilot = Autopilot(armed=armed)
+    m = autopilot.mavlink
+
+    def sent(wanted: bool) -> set:
+        kinds = set()
+        for k in range(200):
+            if k % 50 == 0:
+                autopilot.say(m.heartbeat_encode(2, PX4, ARMED * armed, OFFBOARD, 4))
+            autopilot.node.on_rates_thrust(RatesThrust(0, wanted, (0.0, 0.0, 0.0), 9.81))
+            kinds |= set(autopilot.heard())
+        return kinds & {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}
+
+    try:
+        assert sent(True) == ({"SET_ATTITUDE_TARGET"} if armed else set())
+        assert armed or "this node was started" in autopilot.got["log"][-1].text
+        sent(False)
+        assert sent(True) == ({"SET_ATTITUDE_TARGET"} if armed else {"SET_ATTITUDE_TARGET", "COMMAND_LONG"})
+    finally:
+        autopilot.node.close()
+        autopilot.link.close()
 
 
 def test_what_flies_already_is_asked_for_nothing():
@@ -103,12 +145,12 @@ def test_the_clock_of_the_shortest_way_counts_and_a_jump_is_followed():
 class Autopilot:
     """The other end of the link."""
 
-    def __init__(self, kind: int = PX4) -> None:
+    def __init__(self, kind: int = PX4, armed: bool = False) -> None:
         common = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is an optional extra (scripts/setup.py --extra mavlink)")
         ours, self.link = socket.socketpair()
         self.mavlink = common.MAVLink(None, srcSystem=1, srcComponent=1)
         self.mavlink.robust_parsing = True
-        self.say(self.mavlink.heartbeat_encode(2, kind, 0, 0, 4))
+        self.say(self.mavlink.heartbeat_encode(2, kind, ARMED * armed, 0, 4))
         self.node = Mavlink(MavlinkParameters(link=f"fd:{ours.detach()}"))
         self.got: dict = {}
         for port in ports(Mavlink, Output):
@@ -142,6 +184,7 @@ class Autopilot:
 @pytest.fixture
 def autopilot():
     one = Autopilot()
+    one.command_disarmed()
     yield one
     one.node.close()
     one.link.close()
@@ -236,6 +279,7 @@ def test_ardupilot_gets_set_points_when_it_is_known_to_take_their_thrust():
             said |= autopilot.heard()
         return said
 
+    autopilot.command_disarmed()
     try:
         for options, boost in ((None, None), (0.0, None), (4.0, 0.0), (float("nan"), float("nan")), (9.0, 1.0)):
             said = second(options, boost)
@@ -465,7 +509,7 @@ def test_a_link_that_is_opened_anew_gives_ardupilot_set_points_as_before(options
     if options is not None:
         autopilot.say(m.param_value_encode(b"GUID_OPTIONS", options, 6, 1, 0))
         autopilot.say(m.param_value_encode(b"ATC_ANGLE_BOOST", 0.0, 2, 1, 0))
-    autopilot.heard()
+    autopilot.command_disarmed()
     ours, theirs = socket.socketpair()
     monkeypatch.setattr("perch_autopilot.mavlink.Link", lambda _: Link(f"fd:{ours.detach()}"))
     autopilot.link.close()

@@ -22,6 +22,7 @@ from perch_core.config import quantity, text
 from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust
 from perch_autopilot import frames
+from perch_autopilot.arming import Stop
 from perch_autopilot.clock import MAX_STEP, clock_jump
 from perch_autopilot.offboard import ANGLE_BOOST, ARDUPILOT, GUID_OPTIONS, HEARTBEAT_TIMEOUT, PX4, THRUST_AS_THRUST, Offboard, Request
 from perch_autopilot.link import REOPEN, Link, LinkError
@@ -123,12 +124,14 @@ class Mavlink(Component[MavlinkParameters]):
                     self._handle_message(message, 0)
         if problem := self._absence_reason(0):
             raise PerchError(f"{self.config.link}: {problem}")
+        self.offboard.arming.start(self.offboard.armed)
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Store a command, which each poll sends until it is stale."""
         self._command, self._command_time = command, self._now or 0
+        self.offboard.arming.command((self._now or 0) * 1e-9, command.armed)
 
     def on_command(self, command: ControllerCommand) -> None:
         """Stop the motors on KILL in any mode and at any height, also where no controller is there to obey it, or a frame is lost."""
@@ -182,8 +185,9 @@ class Mavlink(Component[MavlinkParameters]):
         if command is not None and not 0 <= now - self._command_time <= _HELD:
             command = None
         if command is not None and not self.offboard.obeys(command.armed):
-            self.log(LogLine("error", "KILL was received: commands with the motors on are not obeyed until they have them off" if command.armed else
-                             "commands have the motors off, but a flight may have begun before them (was the controller started "
+            stop = self.offboard.arming.stop
+            self.log(LogLine("error", f"{stop.value}: commands with the motors on are not obeyed until they have them off" if stop and command.armed
+                             else "commands have the motors off, but a flight may have begun before them (was the controller started "
                              "again?): not obeyed until the autopilot is disarmed by its pilot or its failsafe", 2.0))
             command = None
         if command is not None:
@@ -194,7 +198,7 @@ class Mavlink(Component[MavlinkParameters]):
         elif request is Request.ARM:
             self._send_command(_ARM_DISARM, 1.0)
         elif request is Request.DISARM:
-            self._send_command(_ARM_DISARM, 0.0, _FORCED if self.offboard.forced or self.offboard.killed else 0.0)
+            self._send_command(_ARM_DISARM, 0.0, _FORCED if self.offboard.forced or self.offboard.arming.stop is Stop.KILL else 0.0)
         if now - self._last_heartbeat >= NANOSECONDS:
             self._last_heartbeat = now
             self._send(self._mavlink.heartbeat_encode(18, 8, 0, 0, 4))                 # ONBOARD_CONTROLLER, INVALID, ACTIVE
@@ -220,9 +224,8 @@ class Mavlink(Component[MavlinkParameters]):
         self.log(LogLine("error", str(error), 1.0))
         self.close()
         before = self.offboard
-        self.offboard = Offboard(before.autopilot, options=before.options, angle_boost=before.angle_boost, was_armed=before.was_armed,
-                                 forced=before.forced, commanding=before.commanding, killed=before.killed,
-                                 _disarm_until=before._disarm_until)
+        self.offboard = Offboard(before.autopilot, options=before.options, angle_boost=before.angle_boost, arming=before.arming,
+                                 forced=before.forced, commanding=before.commanding, _disarm_until=before._disarm_until)
         self._clock, self._last_sample = ClockOffset(), None
 
     def _send_command(self, command: int, *words: float) -> None:
