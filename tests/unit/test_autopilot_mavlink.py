@@ -167,7 +167,7 @@ class Autopilot:
         self.heard()
 
     def heard(self, seconds: float = 0.005) -> dict:
-        """What the node says while it is polled for a time, the last of each kind."""
+        """What the node says while it is polled for a time, the last of each kind; requests of rates are one of their own."""
         for _ in range(max(round(seconds / 0.005), 1)):
             self.now += 5_000_000
             self.node.on_poll(self.now)
@@ -178,7 +178,8 @@ class Autopilot:
             return {}
         finally:
             self.link.setblocking(True)
-        return {message.get_type(): message for message in self.mavlink.parse_buffer(data) or ()}
+        return {"SET_MESSAGE_INTERVAL" if (kind := message.get_type()) == "COMMAND_LONG" and message.command == 511 else kind: message
+                for message in self.mavlink.parse_buffer(data) or ()}
 
 
 @pytest.fixture
@@ -414,6 +415,35 @@ def test_after_kill_commands_with_the_motors_off_disarm_however_late_the_link_is
     machine.kill(1.0)
     asked(machine, 9.0, start=1.0, wanted=False)               # lost, all of it
     assert Request.DISARM in asked(machine, 2.1, start=10.0, wanted=False)
+
+
+def test_the_rate_of_the_imu_is_requested_until_it_comes_and_a_refusal_is_said(autopilot):
+    """An autopilot that restarts has forgotten it."""
+    m, own = autopilot.mavlink, itertools.count(SECOND, 5_000_000)
+
+    def second(every: int) -> list[tuple]:
+        """Requests of a second in which each so manieth poll has a sample; 0: none has."""
+        requests = []
+        autopilot.say(m.heartbeat_encode(2, PX4, 0, 0, 4))
+        for k in range(200):
+            stamp = next(own)
+            if every and k % every == 0:
+                autopilot.say(m.highres_imu_encode(stamp // 1000, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0, 63))
+            if (said := autopilot.heard().get("SET_MESSAGE_INTERVAL")) is not None:
+                requests.append((said.command, said.param1, said.param2))
+        return requests
+
+    second(0)
+    request = (511, 105.0, 5000.0)
+    assert second(0) == second(0) == second(4) == second(4) == [request]
+    assert "HIGHRES_IMU comes 50 times a second instead of 200, as requested" in {line.text for line in autopilot.got["log"]}
+    second(1)
+    autopilot.got["log"].clear()
+    assert second(1) == second(1) == [] == autopilot.got["log"]
+    autopilot.say(m.command_ack_encode(511, 3))
+    second(0)
+    assert autopilot.got["log"][0].text == "the autopilot refuses to send HIGHRES_IMU at 200 Hz: UNSUPPORTED"
+    assert second(0) == [request]
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------
