@@ -104,7 +104,10 @@ class Renderer:
         depth = np.maximum(np.abs((centre_W - p0) * self._faces.normal_W).sum(axis=1), 0.05)
         travel = np.where(moving, np.linalg.norm(path_W - (shifts_W[-1] - shifts_W[0])), np.linalg.norm(path_W))  # relative to each face
         turn = 2.0 * np.arcsin(min(np.linalg.norm(R1 - R0) / np.sqrt(8.0), 1.0))
-        motion = self.mount.camera.fx * (turn + np.sort(travel / depth)[-2])  # of the face with the second fastest image
+        speed = np.sort(travel / depth)[-2]  # of the face with the second fastest image
+        if self._cables is not None:
+            speed = max(speed, np.linalg.norm(path_W) / max(self._cables.distance(p0), 0.05))
+        motion = self.mount.camera.fx * (turn + speed)
         return int(np.clip(np.ceil(motion / BLUR_STEP), 1, MAX_SUBFRAMES))
 
 
