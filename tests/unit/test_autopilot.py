@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import select
@@ -26,7 +27,7 @@ from perch_autopilot.watchdog import CENTRED, OFF, ON, Mode, Watchdog
 from perch_autopilot.link import LinkError
 from perch_core.config import config_dir
 from perch_core.errors import ConfigError
-from perch_core.values import NANOSECONDS, ControllerCommand, RatesThrust
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, RatesThrust
 from perch_core.vehicle import Battery, load_vehicle
 from scipy.spatial.transform import Rotation
 
@@ -154,6 +155,11 @@ def test_the_throttle_follows_the_battery(thrust, voltage, exponent):
     assert sticks.throttle(thrust * share) == throttle
 
 
+def status_of(armed: bool) -> bytes:
+    """Payload of a STATUS of an autopilot without reasons not to arm."""
+    return struct.pack("<HHHIBHBBBBIB", 0, 0, 0, armed, *(0,) * 5, 29, 0, 0)
+
+
 class StubAutopilot:
     """In the place of link and supervisor: an autopilot that answers with its version and its battery's voltage."""
 
@@ -169,7 +175,7 @@ class StubAutopilot:
         known = {msp.FC_VARIANT: b"BTFL", msp.FC_VERSION: bytes((4, 6, 0)),
                  msp.ANALOG: struct.pack("<BHHhH", 0, 0, 0, 0, round(100 * StubAutopilot.voltage)),
                  msp.RAW_IMU: struct.pack("<9h", 0, 0, 2048, *(0,) * 6),
-                 msp.STATUS: struct.pack("<HHHIBHBBBBIB", 0, 0, 0, self.armed, *(0,) * 5, 29, 0, 0)}
+                 msp.STATUS: status_of(self.armed)}
         if self.silent:
             return
         for frame in self._parser.feed(data.replace(b"$M<", b"$M>")):  # requests have the form of answers
@@ -207,8 +213,12 @@ def flown_on(tmp_path, monkeypatch):
                     "  battery: {reference: 16.0, exponent: 1.8, range: [13.6, 16.8]}\n")
 
     def make(voltage: float) -> Betaflight:
+        """A node whose controller has begun with the motors off."""
         monkeypatch.setattr(StubAutopilot, "voltage", voltage)
-        return Betaflight(BetaflightParameters(vehicle=str(file)))
+        node = Betaflight(BetaflightParameters(vehicle=str(file)))
+        node.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
+        node._link.told.clear()
+        return node
 
     return make
 
@@ -291,6 +301,60 @@ def test_who_disarms_the_autopilot_is_obeyed_until_the_commands_have_the_motors_
     monkeypatch.setattr(StubAutopilot, "armed", True)
     polled(node, 8.3, 100, 9.81)
     assert "kill" not in node._link.told
+
+
+def obeyed(node: Betaflight, armed: bool) -> bool:
+    """Give a node a command; return whether its link is told that the motors are to turn."""
+    node._link.told.clear()
+    node.on_rates_thrust(RatesThrust(0, armed, (0.0, 0.0, 0.0), 9.81 * armed))
+    return [word[0] for word in node._link.told if word != "kill"] == [True]
+
+
+def test_kill_ends_with_a_command_with_the_motors_off_when_the_autopilot_has_been_disarmed(flown_on, monkeypatch):
+    """Until then nobody knows whether it has arrived."""
+    node = flown_on(16.0)
+    monkeypatch.setattr(StubAutopilot, "armed", True)
+    assert polled(node, 1.0, 100, 9.81) == []
+    node.on_command(ControllerCommand(0, Command.KILL, "by hand"))
+    assert not obeyed(node, False) and not obeyed(node, True)
+    monkeypatch.setattr(StubAutopilot, "armed", False)
+    polled(node, 2.0, 50)                                # the request came before it was disarmed
+    assert not obeyed(node, True)
+    assert not obeyed(node, False) and obeyed(node, True)
+    node.on_command(ControllerCommand(0, Command.KILL, "by hand"))
+    assert not obeyed(node, False)
+    polled(node, 3.0, 50)
+    assert node._link.told[-1] == (False, CENTRED) and obeyed(node, True)
+
+
+@pytest.mark.parametrize("armed", [False, True])
+def test_a_node_that_is_started_obeys_commands_to_arm_only_after_one_with_the_motors_off(armed, flown_on, monkeypatch):
+    """A KILL before its start is not known; what flies is flown on."""
+    file = flown_on(16.0).config.vehicle
+    monkeypatch.setattr(StubAutopilot, "armed", armed)
+    node = Betaflight(BetaflightParameters(vehicle=file))
+    assert obeyed(node, True) is armed
+    said = polled(node, 1.0, 200, 9.81)
+    assert said == ([] if armed else ["the autopilot refuses to arm: this node was started: disarm first"])
+    node._link.ended = True
+    polled(node, 3.0, 1, 9.81)
+    assert obeyed(node, True) is armed
+    assert not obeyed(node, False) and obeyed(node, True)
+
+
+def test_a_disarm_and_an_arm_between_two_reports_arm(flown_on, monkeypatch):
+    """The first report after them may be from before: that it is disarmed later is by the command."""
+    node = flown_on(16.0)
+    monkeypatch.setattr(StubAutopilot, "armed", True)
+    assert polled(node, 1.0, 100, 9.81) == []
+    assert not obeyed(node, False)
+    for armed in (True, False, False, False):
+        monkeypatch.setattr(StubAutopilot, "armed", armed)
+        assert obeyed(node, True)
+        node._handle_frame(msp.Frame(msp.STATUS, status_of(armed), False), 2 * NANOSECONDS)
+    assert obeyed(node, True)
+    monkeypatch.setattr(StubAutopilot, "armed", True)
+    assert polled(node, 2.5, 100, 9.81) == []
 
 
 def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):
@@ -620,6 +684,22 @@ def test_a_firmware_in_the_loop_that_ends_is_named_at_once():
             running.receive(60.0)
         with pytest.raises(firmware.FirmwareError, match="cannot be sent anything: Broken pipe"):
             running.send(b"#")
+
+
+def test_a_copy_of_the_firmwares_memory_that_breaks_off_leaves_no_file(tmp_path, monkeypatch):
+    def breaks_off(source, copy) -> None:
+        copy.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sitl, "Cli", lambda *_: SimpleNamespace(apply=lambda _: None, check=lambda _: None))
+    monkeypatch.setattr(sitl.Sitl, "_launch", lambda *_: None)
+    monkeypatch.setattr(sitl.shutil, "copyfile", breaks_off)
+    running = sitl.Sitl.__new__(sitl.Sitl)
+    running._program, running._configuration = tmp_path / "betaflight_sitl", Configuration("mine.txt", ())
+    running._running = SimpleNamespace(process=SimpleNamespace(wait=lambda _: 0), close=lambda: None)
+    with pytest.raises(OSError, match="No space left"):
+        running._configured(tmp_path / "draft")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_rates_of_another_type_are_refused():

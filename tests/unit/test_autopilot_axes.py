@@ -72,6 +72,7 @@ def node():
         for name in names:
             sys.modules.pop(name) if before[name] is None else sys.modules.update({name: before[name]})
     one.on_poll(NANOSECONDS)
+    one.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
     yield one
     one.close()
     theirs.close()

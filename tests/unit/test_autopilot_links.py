@@ -169,6 +169,31 @@ def test_a_process_for_the_link_that_cannot_be_started_is_one_line(monkeypatch):
     assert len(os.listdir("/proc/self/fd")) == files
 
 
+def test_a_link_that_is_opened_again_does_not_wait_for_an_autopilot_that_does_not_answer(monkeypatch):
+    """The nodes' loops would stand still for 3 s. A server whose queue is full does not answer."""
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen(0)
+        address = f"tcp:127.0.0.1:{server.getsockname()[1]}"
+        Link(address).close()
+        monkeypatch.setattr(socket, "create_connection", lambda *_, **__: pytest.fail("it waits"))
+        link = Link(address)
+        assert not link.connected() and not link.write(b"dropped") and link.read() == b""
+        server.accept()[0].close()                             # its queue is free: the next attempt of the system succeeds
+        last = time.monotonic() + 60.0
+        while not link.connected():
+            assert time.monotonic() < last
+            time.sleep(0.01)
+        assert link.write(b"$M<")
+        with server.accept()[0] as peer:
+            assert peer.recv(9) == b"$M<"
+        link.close()
+    with pytest.raises(LinkError, match="Connection refused"):
+        link = Link(address)
+        while not link.connected():
+            assert time.monotonic() < last
+
+
 @pytest.fixture(params=["serial", "tcp"])
 def address(request) -> Iterator[str]:
     """A serial port, or one by TCP."""

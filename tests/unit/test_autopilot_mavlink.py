@@ -22,6 +22,8 @@ def asked(machine: Offboard, seconds: float, start: float = 0.0, wanted: bool = 
     out = []
     for k in range(round(100 * seconds)):
         now = start + 0.01 * k
+        if streaming:
+            machine.arming.command(now, wanted)
         machine.heartbeat(now, machine.autopilot, ARMED * machine.armed, machine.mode if machine.following else 0)
         out.append(machine.next_request(now, wanted, streaming))
     return [request for request in out if request is not Request.NOTHING]
@@ -58,6 +60,46 @@ def test_who_disarms_the_autopilot_is_obeyed_until_the_commands_have_the_motors_
     assert asked(machine, 5.0, start=1.0) == []
     asked(machine, 0.1, start=6.0, wanted=False)
     assert asked(machine, 1.5, start=6.1)[0] is (Request.ARM if following else Request.MODE)
+
+
+def test_a_disarm_and_an_arm_between_two_heartbeats_arm():
+    """The last heartbeat before them has it armed: that the next one has not is by the command."""
+    machine = Offboard(autopilot=PX4, following=True)
+    machine.heartbeat(0.0, PX4, ARMED, OFFBOARD)
+    requests = []
+    for k in range(300):
+        now, wanted = 0.01 * k, not 110 <= k < 130
+        if k % 100 == 0:
+            machine.heartbeat(now, PX4, ARMED * (k < 200), OFFBOARD)
+        machine.arming.command(now, wanted)
+        requests.append((now, machine.next_request(now, wanted, True)))
+    assert [(pytest.approx(now), request) for now, request in requests if request is not Request.NOTHING] == [
+        (1.1, Request.DISARM), (2.1, Request.ARM)]
+
+
+@pytest.mark.parametrize("armed", [False, True])
+def test_a_node_that_is_started_arms_only_after_a_command_with_the_motors_off(armed):
+    """A KILL before its start is not known; what flies is flown on."""
+    autopilot = Autopilot(armed=armed)
+    m = autopilot.mavlink
+
+    def sent(wanted: bool) -> set:
+        kinds = set()
+        for k in range(200):
+            if k % 50 == 0:
+                autopilot.say(m.heartbeat_encode(2, PX4, ARMED * armed, OFFBOARD, 4))
+            autopilot.node.on_rates_thrust(RatesThrust(0, wanted, (0.0, 0.0, 0.0), 9.81))
+            kinds |= set(autopilot.heard())
+        return kinds & {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}
+
+    try:
+        assert sent(True) == ({"SET_ATTITUDE_TARGET"} if armed else set())
+        assert armed or "this node was started" in autopilot.got["log"][-1].text
+        sent(False)
+        assert sent(True) == ({"SET_ATTITUDE_TARGET"} if armed else {"SET_ATTITUDE_TARGET", "COMMAND_LONG"})
+    finally:
+        autopilot.node.close()
+        autopilot.link.close()
 
 
 def test_what_flies_already_is_asked_for_nothing():
@@ -103,12 +145,12 @@ def test_the_clock_of_the_shortest_way_counts_and_a_jump_is_followed():
 class Autopilot:
     """The other end of the link."""
 
-    def __init__(self, kind: int = PX4) -> None:
+    def __init__(self, kind: int = PX4, armed: bool = False) -> None:
         common = pytest.importorskip("pymavlink.dialects.v20.common", reason="pymavlink is an optional extra (scripts/setup.py --extra mavlink)")
         ours, self.link = socket.socketpair()
         self.mavlink = common.MAVLink(None, srcSystem=1, srcComponent=1)
         self.mavlink.robust_parsing = True
-        self.say(self.mavlink.heartbeat_encode(2, kind, 0, 0, 4))
+        self.say(self.mavlink.heartbeat_encode(2, kind, ARMED * armed, 0, 4))
         self.node = Mavlink(MavlinkParameters(link=f"fd:{ours.detach()}"))
         self.got: dict = {}
         for port in ports(Mavlink, Output):
@@ -125,7 +167,7 @@ class Autopilot:
         self.heard()
 
     def heard(self, seconds: float = 0.005) -> dict:
-        """What the node says while it is polled for a time, the last of each kind."""
+        """What the node says while it is polled for a time, the last of each kind; requests of rates are one of their own."""
         for _ in range(max(round(seconds / 0.005), 1)):
             self.now += 5_000_000
             self.node.on_poll(self.now)
@@ -136,12 +178,14 @@ class Autopilot:
             return {}
         finally:
             self.link.setblocking(True)
-        return {message.get_type(): message for message in self.mavlink.parse_buffer(data) or ()}
+        return {"SET_MESSAGE_INTERVAL" if (kind := message.get_type()) == "COMMAND_LONG" and message.command == 511 else kind: message
+                for message in self.mavlink.parse_buffer(data) or ()}
 
 
 @pytest.fixture
 def autopilot():
     one = Autopilot()
+    one.command_disarmed()
     yield one
     one.node.close()
     one.link.close()
@@ -236,6 +280,7 @@ def test_ardupilot_gets_set_points_when_it_is_known_to_take_their_thrust():
             said |= autopilot.heard()
         return said
 
+    autopilot.command_disarmed()
     try:
         for options, boost in ((None, None), (0.0, None), (4.0, 0.0), (float("nan"), float("nan")), (9.0, 1.0)):
             said = second(options, boost)
@@ -372,6 +417,35 @@ def test_after_kill_commands_with_the_motors_off_disarm_however_late_the_link_is
     assert Request.DISARM in asked(machine, 2.1, start=10.0, wanted=False)
 
 
+def test_the_rate_of_the_imu_is_requested_until_it_comes_and_a_refusal_is_said(autopilot):
+    """An autopilot that restarts has forgotten it."""
+    m, own = autopilot.mavlink, itertools.count(SECOND, 5_000_000)
+
+    def second(every: int) -> list[tuple]:
+        """Requests of a second in which each so manieth poll has a sample; 0: none has."""
+        requests = []
+        autopilot.say(m.heartbeat_encode(2, PX4, 0, 0, 4))
+        for k in range(200):
+            stamp = next(own)
+            if every and k % every == 0:
+                autopilot.say(m.highres_imu_encode(stamp // 1000, 0.0, 0.0, -9.81, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0, 0, 63))
+            if (said := autopilot.heard().get("SET_MESSAGE_INTERVAL")) is not None:
+                requests.append((said.command, said.param1, said.param2))
+        return requests
+
+    second(0)
+    request = (511, 105.0, 5000.0)
+    assert second(0) == second(0) == second(4) == second(4) == [request]
+    assert "HIGHRES_IMU comes 50 times a second instead of 200, as requested" in {line.text for line in autopilot.got["log"]}
+    second(1)
+    autopilot.got["log"].clear()
+    assert second(1) == second(1) == [] == autopilot.got["log"]
+    autopilot.say(m.command_ack_encode(511, 3))
+    second(0)
+    assert autopilot.got["log"][0].text == "the autopilot refuses to send HIGHRES_IMU at 200 Hz: UNSUPPORTED"
+    assert second(0) == [request]
+
+
 # -- bad input ---------------------------------------------------------------------------------------------------------
 
 def test_a_hosts_clock_that_jumps_is_one_line_and_everything_goes_on(autopilot):
@@ -465,7 +539,7 @@ def test_a_link_that_is_opened_anew_gives_ardupilot_set_points_as_before(options
     if options is not None:
         autopilot.say(m.param_value_encode(b"GUID_OPTIONS", options, 6, 1, 0))
         autopilot.say(m.param_value_encode(b"ATC_ANGLE_BOOST", 0.0, 2, 1, 0))
-    autopilot.heard()
+    autopilot.command_disarmed()
     ours, theirs = socket.socketpair()
     monkeypatch.setattr("perch_autopilot.mavlink.Link", lambda _: Link(f"fd:{ours.detach()}"))
     autopilot.link.close()

@@ -13,6 +13,7 @@ pytest.importorskip("rclpy")
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from perch_core.component import Action, Client, Component, Output, Service, Timer, Unavailable  # noqa: E402
 from perch_core.errors import ConfigError, PerchError  # noqa: E402
+from perch_core.registry import resolved  # noqa: E402
 from perch_core.ros.arrival import ArrivalNode  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
 from perch_core.values import CameraImage, PerchFeedback, PerchGoal, PerchResult, TargetPose  # noqa: E402
@@ -21,8 +22,9 @@ from perch_msgs.action import Perch  # noqa: E402
 from perch_msgs.srv import PlanPerch  # noqa: E402
 from perch_sim.lockstep.link import ParticipantListener, address, connect_to_vehicle, pack, unpack  # noqa: E402
 from perch_sim.ros.participant_node import ParticipantNode  # noqa: E402
-from perch_sim.ros.vehicle_node import VehicleNode  # noqa: E402
+from perch_sim.ros.vehicle_node import RealTimeVehicleNode, VehicleNode  # noqa: E402
 from perch_sim.simulated_vehicle import SimulatedVehicle  # noqa: E402
+from perch_sim.vehicle_node import NODE  # noqa: E402
 from rclpy.action import ActionClient  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from unit.test_requests_of_nodes import REQUEST, Nothing, until  # noqa: E402
@@ -109,8 +111,9 @@ def test_an_answer_that_comes_after_its_request_was_dropped_is_not_that_of_the_n
     asking, replies = participant(executor, Asking), created(executor, ArrivalNode, Serving).component.replies
     asking.component.plan_perch(REQUEST, 0)
     until(executor, lambda: len(replies) == 1)
-    monkeypatch.setattr("perch_sim.ros.participant_node.ANSWER_TIMEOUT", -1.0)
-    asking._check_requests()
+    with monkeypatch.context() as patched:  # the node's timer would drop the next one, too
+        patched.setattr("perch_sim.ros.participant_node.ANSWER_TIMEOUT", -1.0)
+        asking._check_requests()
     asking.component.plan_perch(REQUEST, 0)
     first, second = answered(executor, asking, replies, "late", "second")
     assert "has not answered" in first and second == "second"
@@ -281,6 +284,18 @@ class Drawing(Component[Nothing]):
 def test_pictures_for_people_are_not_drawn_for_a_vehicle_in_another_process(executor):
     drawing = created(executor, ParticipantNode, Drawing).component
     assert drawing.target.has_receivers and not drawing.debug_image.has_receivers
+
+
+def test_a_second_vehicle_in_a_ros_domain_and_namespace_is_refused(executor):
+    """In real time, too: two would send samples and images by turns."""
+    where = address(os.environ.get("ROS_DOMAIN_ID", "0"), "/")
+    first = created(executor, resolved(NODE.real_time), Drawing)
+    with pytest.raises(PerchError, match="another vehicle runs in this ROS domain and namespace"):
+        created(executor, RealTimeVehicleNode, Drawing)
+    with pytest.raises(PerchError, match="another vehicle runs in this ROS domain and namespace"):
+        ParticipantListener(where)
+    first.close()
+    ParticipantListener(where).close()
 
 
 def test_a_value_without_a_message_ends_no_process(executor, monkeypatch):

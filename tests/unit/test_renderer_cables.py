@@ -11,6 +11,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.catenary import Catenary
 from perch_core.surface import PerchSurface
 from perch_sim.rendering import CableCurve, Renderer, Scene, build_scene
+from perch_sim.rendering.renderer import spread
 from perch_sim.scenario import Cable, Scenario, World
 from unit.camera_mounts import looking_along
 
@@ -103,6 +104,22 @@ def test_the_nearer_cable_covers_the_farther():
     image = light(plain_room(near, far), PINHOLE)
     assert image[240, 320] == 0 and image[240, 250] > 140
     np.testing.assert_array_equal(image, light(plain_room(far, near), PINHOLE))
+
+
+def test_a_near_wire_is_blurred_by_its_own_motion():
+    """Against many instants of the exposure; the walls, 2 m away and more, move by a quarter of that."""
+    wire = CableCurve(np.array([[0.5, 0.0, 0.5], [0.5, 0.0, 3.5]]), 0.005, BLACK)
+    camera = PinholeCamera(80, 20, 385.0, 385.0, 40.0, 10.0)
+    renderer = Renderer(plain_room(wire), CameraMount("front", camera, np.zeros(3), AHEAD))
+    p, R = HERE
+    poses = [(p, R), (p + [0.0, 0.01, 0.0], R)]                    # 7.7 px
+
+    def mean(count: int) -> np.ndarray:
+        lights = [renderer._light(*renderer.mount.pose(*pose), np.zeros(3)).astype(float) for pose in spread(poses, count)]
+        return np.mean(lights, axis=0)[10]
+
+    exact = mean(40)
+    assert np.abs(mean(renderer._subframes(poses, np.zeros((2, 3)))) - exact).max() < 0.2 * np.ptp(exact)
 
 
 def test_red_cables_are_red_and_the_textured_room_is_not():

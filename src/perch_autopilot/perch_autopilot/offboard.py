@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
+
+from perch_autopilot.arming import Arming, Stop
 
 PX4, ARDUPILOT = 12, 3              # MAV_AUTOPILOT
 ARMED = 128                         # MAV_MODE_FLAG_SAFETY_ARMED
@@ -37,12 +39,10 @@ class Offboard:
         following: whether the autopilot is in the mode in which it follows set points.
         options: ArduPilot's GUID_OPTIONS; 0 until received.
         angle_boost: ArduPilot's ATC_ANGLE_BOOST; None until received.
-        was_armed: the autopilot has been armed since the last command with the motors off. If somebody else disarms it then, neither
-            mode nor arming is requested until the next such command.
+        arming: whether commands with the motors on are obeyed; not of the autopilot's state, which a link that is lost resets.
         forced: the autopilot was commanded with the motors on since it was last disarmed, so it must disarm also in flight.
         commanding: commands have come without a gap since the motors were commanded on, or since the autopilot was disarmed. Only then
             are commands with the motors off obeyed: a controller that was started again in flight is disarmed.
-        killed: KILL was received; no command with the motors on is obeyed until one has them off while the autopilot is disarmed.
     """
 
     autopilot: int = 0
@@ -50,10 +50,9 @@ class Offboard:
     following: bool = False
     options: int = 0
     angle_boost: int | None = None
-    was_armed: bool = False
+    arming: Arming = field(default_factory=Arming, compare=False)
     forced: bool = False
     commanding: bool = False
-    killed: bool = False
     _disarm_until: float = -1e9
     _last_heartbeat: float = -1e9
     _streaming_since: float | None = None
@@ -69,6 +68,7 @@ class Offboard:
         """Record a heartbeat of the autopilot at a time [s]."""
         self._last_heartbeat, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
         self.following = custom_mode == self.mode
+        self.arming.report(now, self.armed)
         if not self.armed:
             self._disarm_until = -1e9
 
@@ -78,7 +78,8 @@ class Offboard:
 
     def kill(self, now: float) -> None:
         """Record KILL, which the autopilot is sent, at a time [s]. It is not repeated for long: a pilot may have armed it then."""
-        self.killed, self._disarm_until, self._last_request = True, now + KILL_TIME, now
+        self.arming.halt(Stop.KILL)
+        self._disarm_until, self._last_request = now + KILL_TIME, now
 
     @property
     def takes_thrust(self) -> bool:
@@ -92,7 +93,7 @@ class Offboard:
 
     def obeys(self, armed: bool) -> bool:
         """Return whether the autopilot may be sent a command with the motors on (`armed`) or off."""
-        return not self.killed if armed else self.commanding or not self.armed
+        return self.arming.stop is None if armed else self.commanding or not self.armed
 
     def next_request(self, now: float, wanted: bool, streaming: bool) -> Request:
         """Return the request to send at a time, at most one each `REQUEST_PERIOD` seconds.
@@ -115,18 +116,16 @@ class Offboard:
         self.commanding = continued or streaming and (wanted or self.alive(now) and not self.armed)
         request = Request.NOTHING
         stopped = streaming and not wanted and self.commanding and self.armed and self.following  # by commands with the motors off
-        if self.killed:
-            self.killed = self.armed or wanted or not (streaming and self.alive(now))
+        if self.arming.stop is Stop.KILL:
             request = Request.DISARM if stopped or now <= self._disarm_until else request
         elif not self.alive(now) or self.autopilot not in (PX4, ARDUPILOT):
             return request
         elif not wanted:
             request = Request.DISARM if stopped else request
-            self.was_armed = self.was_armed and not streaming
             self.forced = self.forced and self.armed
         elif self.armed:
-            self.was_armed = self.forced = True
-        elif not self.was_armed and self._streaming_since is not None and now - self._streaming_since >= MIN_STREAMING_TIME:
+            self.forced = True
+        elif self.arming.stop is None and self._streaming_since is not None and now - self._streaming_since >= MIN_STREAMING_TIME:
             request = Request.ARM if self.following else Request.MODE
         if request is Request.NOTHING or 0.0 <= now - self._last_request < REQUEST_PERIOD:
             return Request.NOTHING

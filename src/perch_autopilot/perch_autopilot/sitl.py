@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import struct
 import subprocess
@@ -19,6 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from perch_core.arrays import Numbers
+from perch_core.files import replacement
 from perch_autopilot import firmware, msp
 from perch_autopilot.configuration import Cli, CliError, Configuration
 from perch_autopilot.firmware import FirmwareError
@@ -88,9 +88,8 @@ class Sitl:
             self._launch(draft)
             Cli(self.send, self.receive).check(self._configuration)
             self.close()
-            made = memory.with_suffix(f".{os.getpid()}-{id(self)}")
-            shutil.copyfile(draft, made)
-            made.replace(memory)
+            with replacement(memory) as copy:
+                shutil.copyfile(draft, copy)
         return memory
 
     def _launch(self, memory: Path) -> None:

@@ -52,6 +52,7 @@ class LinkSupervisor:
         """
         self._address, self._control, self._watchdog, self._period, self._clock = address, control, watchdog, 1.0 / RATE, clock
         self._link: Link | None = Link(address)
+        self._opening: Link | None = None  # in place of one that has ended
         self._due = self._opened = self._stopped = clock()
         self._reported, self._node_gone, self._final_frames = Mode.DISARMED, False, 0
         self._parser = msp.Parser()
@@ -83,12 +84,14 @@ class LinkSupervisor:
         if self._link is None and now - self._opened > REOPEN:
             self._opened = now
             try:
-                self._link = Link(self._address)
-                self._report_mode()  # in place of the end of the link
+                self._opening = self._opening or Link(self._address)
+                if self._opening.connected():
+                    self._link, self._opening = self._opening, None
+                    self._report_mode()  # in place of the end of the link
             except PortTaken:
                 done = True
             except LinkError:
-                pass
+                self._opening = None
         if self._watchdog.command_received:
             done |= self._send(msp.channels(channels) + (msp.request(msp.ATTITUDE) if self._watchdog.needs_attitude(now) else b""))
         if not (self._node_gone and self._reported is Mode.DISARMED):

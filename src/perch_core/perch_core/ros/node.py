@@ -31,6 +31,7 @@ from rclpy.task import Future
 
 CHECK_PERIOD = 0.1     # of the check for a stop signal, wall clock [s]
 SHUTDOWN_TIMEOUT = 20  # for the end of a process after its stop signal [s]
+REAL_TIME = "perch_core.ros.arrival:ArrivalNode"
 LOCKSTEP = "perch_sim.ros.participant_node:ParticipantNode"  # the simulator's host: perch_core's only reference to it
 
 
@@ -43,7 +44,7 @@ class NodeSpec:
         component: class of the component.
         choose: returns the class for the parameter `type`, where there are several.
         deadline: output whose answers have a deadline in real time; empty: none.
-        lockstep: class of the node in lockstep, `module:class`.
+        lockstep, real_time: class of the node in lockstep and otherwise, `module:class`.
     """
 
     name: str
@@ -51,6 +52,7 @@ class NodeSpec:
     deadline: str = ""
     lockstep: str = LOCKSTEP
     choose: Callable[[str], type[Component[Any]]] | None = None
+    real_time: str = REAL_TIME
 
     def create(self, wiring: Wiring | None = None, **kwargs: Any) -> ComponentNode:
         """Create the node, with the host that the parameter `lockstep` selects. `kwargs` go to `rclpy.node.Node`.
@@ -64,7 +66,8 @@ class NodeSpec:
             if values.get("lockstep"):
                 lockstep: type[ComponentNode] = resolved(self.lockstep)
                 return lockstep(self.name, component, wiring, **kwargs)
-            return ArrivalNode(self.name, component, wiring, deadline=self.deadline, **kwargs)
+            real_time: type[ArrivalNode] = resolved(self.real_time)
+            return real_time(self.name, component, wiring, deadline=self.deadline, **kwargs)
 
     def main(self) -> None:
         """Entry point of the executable: run until SIGINT or SIGTERM; exit code 0, or 2 when parameters are refused."""
@@ -72,9 +75,9 @@ class NodeSpec:
 
 
 def node(name: str, component: type[Component[Any]], deadline: str = "", lockstep: str = LOCKSTEP,
-         choose: Callable[[str], type[Component[Any]]] | None = None) -> NodeSpec:
+         choose: Callable[[str], type[Component[Any]]] | None = None, real_time: str = REAL_TIME) -> NodeSpec:
     """Return a `NodeSpec`. Node files have `NODE = node("controller", Controller)` and `create, main = NODE.create, NODE.main`."""
-    return NodeSpec(name, component, deadline, lockstep, choose)
+    return NodeSpec(name, component, deadline, lockstep, choose, real_time)
 
 
 @contextmanager

@@ -74,6 +74,27 @@ def unpack(data: bytes, codec: Codec) -> tuple[int, list[Packet]]:
     return stamp, packets
 
 
+def claimed(where: str) -> socket.socket:
+    """Return a socket at the address of a vehicle in real time, to which nobody connects: while it is open, there is no other vehicle.
+
+    Raises:
+        PerchError: another vehicle has this address.
+    """
+    claim = socket.socket(socket.AF_UNIX)
+    try:
+        claim.bind(where)
+    except OSError as error:
+        claim.close()
+        raise _refusal(where, error) from None
+    return claim
+
+
+def _refusal(where: str, error: OSError) -> PerchError:
+    if error.errno != errno.EADDRINUSE:
+        return PerchError(f"vehicle: cannot have the address {where[1:]!r}: {error}")
+    return PerchError("another vehicle runs in this ROS domain and namespace")
+
+
 class ParticipantListener:
     """The vehicle's listening socket, which accepts participants."""
 
@@ -85,9 +106,7 @@ class ParticipantListener:
         try:
             self._listener = Listener(where, "AF_UNIX", backlog=16)
         except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise PerchError(f"lockstep: cannot listen at {where[1:]!r}: {error}") from None
-            raise PerchError("another vehicle runs a lockstep in this ROS domain and namespace") from None
+            raise _refusal(where, error) from None
         self._socket: socket.socket = self._listener._listener._socket  # type: ignore[attr-defined]  # non-blocking accept
         self._socket.setblocking(False)
 

@@ -55,6 +55,10 @@ class CablePainter:
         rays = camera.unproject(np.stack([u, v], axis=-1)).reshape(-1, 3)
         self._rays = np.where(np.isfinite(rays), rays, 0.0).astype(np.float32)
 
+    def distance(self, p_W: np.ndarray) -> float:
+        """Return the distance of the nearest cable from a point in W [m]."""
+        return min(float(np.linalg.norm(points_W - p_W, axis=1).min()) for points_W, _ in self.cables)
+
     def paint(self, image: np.ndarray, p_WC: np.ndarray, R_WC: np.ndarray, faces: np.ndarray, half: np.ndarray) -> None:
         """Paint every cable into the image, the farthest first.
 

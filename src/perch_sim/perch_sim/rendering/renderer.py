@@ -45,7 +45,7 @@ class Renderer:
         Args:
             scene: scene to render; renderers of the same `Scene` object share its textures.
             mount: the camera and its pose on the body; `mount.colour` selects rgb8.
-            seed: seed of the sensor's noise bank.
+            seed: seed of the sensor's noise bank, which each camera has for itself.
         """
         self.scene, self.mount = scene, mount
         self.exposure = control_exposure(mount, scene.light)
@@ -55,7 +55,7 @@ class Renderer:
         self._raster = Rasterizer(self._faces, build_atlas(scene), mount.camera, self._grid)
         self._cables = CablePainter(scene.cables, mount.camera) if scene.cables else None
         self._tint = np.rint(TINT).astype(np.uint8)[None]
-        self._sensor = Sensor(mount.camera, self.exposure, 3 if mount.colour else 1, seed)
+        self._sensor = Sensor(mount.camera, self.exposure, 3 if mount.colour else 1, seed, mount.name)
 
     def render(self, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray = np.zeros(3),
                region: Region | None = None) -> np.ndarray:
@@ -104,7 +104,10 @@ class Renderer:
         depth = np.maximum(np.abs((centre_W - p0) * self._faces.normal_W).sum(axis=1), 0.05)
         travel = np.where(moving, np.linalg.norm(path_W - (shifts_W[-1] - shifts_W[0])), np.linalg.norm(path_W))  # relative to each face
         turn = 2.0 * np.arcsin(min(np.linalg.norm(R1 - R0) / np.sqrt(8.0), 1.0))
-        motion = self.mount.camera.fx * (turn + np.sort(travel / depth)[-2])  # of the face with the second fastest image
+        speed = np.sort(travel / depth)[-2]  # of the face with the second fastest image
+        if self._cables is not None:
+            speed = max(speed, np.linalg.norm(path_W) / max(self._cables.distance(p0), 0.05))
+        motion = self.mount.camera.fx * (turn + speed)
         return int(np.clip(np.ceil(motion / BLUR_STEP), 1, MAX_SUBFRAMES))
 
 

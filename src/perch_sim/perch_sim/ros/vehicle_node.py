@@ -1,4 +1,4 @@
-"""Node of the vehicle in lockstep: owns the schedule, and advances when all results that are due have arrived."""
+"""Nodes of the vehicle. In lockstep it owns the schedule, and advances when all results that are due have arrived."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from collections.abc import Callable
 from typing import Any
 
 from perch_core.component import Component, Input, ports
+from perch_core.errors import PerchError
 from perch_core.ros import topics
+from perch_core.ros.arrival import ArrivalNode
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.intake import SHARED_TOPICS
 from perch_core.ros.wiring import Publication, Wiring, foreign_publishers
 from perch_core.values import CameraImage
 from perch_sim.lockstep import START_DEADLINE, Schedule, flight_tasks
-from perch_sim.lockstep.link import ConnectionPoll, ParticipantListener, address
+from perch_sim.lockstep.link import ConnectionPoll, ParticipantListener, address, claimed
 from perch_sim.pacing import Pacing
 from perch_sim.ros.remote import RemoteParticipant
 from perch_sim.timing import CONTROL_PERIOD, CONTROL_PERIOD_NS
@@ -29,6 +31,31 @@ BURST = 40                  # steps between which other events are processed
 IMAGE_TIMEOUT = 0.02        # one wait for an image without which the flight cannot continue [s]
 START_TIMEOUT = 60.0        # for participants to connect; longer if `lockstep_timeout` is [s]
 START_CHECKS = 3            # consecutive checks with all participants connected before the first step
+
+
+class RealTimeVehicleNode(ArrivalNode):
+    """Node of `SimulatedVehicle` in real time, the only one of its ROS domain and namespace on this machine."""
+
+    def __init__(self, name: str, component: type[Component], wiring: Wiring, **kwargs: Any) -> None:
+        """
+        Args:
+            name, component, wiring, kwargs: as in `ArrivalNode`.
+
+        Raises:
+            PerchError: there is another one.
+        """
+        super().__init__(name, component, wiring, **kwargs)
+        try:
+            self._claim = claimed(address(os.environ.get("ROS_DOMAIN_ID", "0"), self.get_namespace()))
+        except PerchError:
+            super().close()
+            self.destroy_node()
+            raise
+
+    def close(self) -> None:
+        """As in `ComponentNode`; another vehicle may start then."""
+        self._claim.close()
+        super().close()
 
 
 class VehicleNode(ComponentNode):
