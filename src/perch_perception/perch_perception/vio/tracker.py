@@ -174,10 +174,11 @@ class Tracker:
         least = _CROWDING * _SPACING
         if len(self._pixels) < 2:
             return
-        between = np.linalg.norm(self._pixels[:, None] - self._pixels[None], axis=2)
+        u, v = (x[:, None] - x for x in self._pixels.T)
+        close = np.tril(np.sqrt(u * u + v * v) < least, -1)  # numbers increase: older ones come first
         kept = np.ones(len(self._ids), bool)
-        for k in np.flatnonzero((np.tril(between < least, -1)).any(axis=1)):  # numbers increase: older ones come first
-            kept[k] = not (between[k, :k] < least)[kept[:k]].any()
+        for k in np.flatnonzero(close.any(axis=1)):
+            kept[k] = not close[k, kept].any()
         self._pixels, self._ids = self._pixels[kept], self._ids[kept]
 
     def _choose_reference(self, image: np.ndarray) -> None:
