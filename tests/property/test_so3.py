@@ -61,6 +61,13 @@ def test_hat_is_the_cross_product():
     assert np.allclose(np.einsum("nij,nj->ni", so3.hat(a), b), np.cross(a, b), rtol=0.0, atol=1e-14)
 
 
+def test_vector_products_have_the_bits_of_numpy():
+    rng = np.random.default_rng(7)
+    for a, b in (((3,), (3,)), ((50, 3), (50, 3)), ((3,), (50, 3)), ((9, 1, 3), (9, 4, 3))):
+        a, b = rng.normal(size=a), rng.normal(size=b)
+        assert so3.cross(a, b).tobytes() == np.cross(a, b).tobytes()
+
+
 def test_yaw_survives_a_pitch_to_90_degrees():
     for yaw in (-2.0, 0.3, 3.0):
         for pitch in (0.0, -np.pi / 2, -1.0):

@@ -276,6 +276,14 @@ def test_differences_that_nobody_can_measure_are_no_other_camera():
     assert any(mounted.take_model(CameraModel(k, FRAME, replace(CAMERA, fx=CAMERA.fx * 1.001))) for k in range(10))
 
 
+def test_a_camera_that_repeats_its_intrinsics_costs_no_arrays(monkeypatch):
+    mounted = MountedCamera(FRONT, False, "file", lambda text, period: None)
+    mounted.take_model(CameraModel(0, FRAME, replace(CAMERA, fx=CAMERA.fx * 1.1)))
+    monkeypatch.setattr("perch_perception.mounted_camera.astuple", lambda camera: pytest.fail("compared number by number"))
+    for k in range(1, 3):
+        assert not mounted.take_model(CameraModel(k, FRAME, replace(CAMERA, fx=CAMERA.fx * 1.1)))
+
+
 def test_another_frame_is_believed_when_it_stays():
     mounted = MountedCamera(FRONT, False, "tf", lambda text, period: None)
     for frame, x in ((FRAME, 0.1), ("tail", -0.1)):

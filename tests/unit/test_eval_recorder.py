@@ -20,6 +20,7 @@ from perch_eval.report import build_report, outcome_text, summary
 from perch_eval.ros.recorded_flight import RecordedFlight, write
 from perch_eval.ros.recorder import CHANNELS, Recorder, RecorderParameters
 from perch_core.component import Diagnostics, Input, ports
+from perch_sim.lockstep import LocalParticipant, Packet
 from perch_sim.scenario import load_scenario
 
 STEP = 2_000_000  # [ns]
@@ -90,6 +91,30 @@ def test_values_are_taken_as_well_as_messages_and_topics_have_the_namespace(tmp_
     assert [(topic, time) for topic, _, time, _ in read(recording.path)] == [
         ("/quad1/odometry", STEP), ("/quad1/odometry", 2 * STEP), ("/quad1/camera_front/image_raw/compressed", 3 * STEP)]
     assert [v.p_WB for _, v in RecordedFlight(recording.path, "quad1").values("odometry")] == [state(1).p_WB, state(2).p_WB]
+
+
+class NoConversions:
+    """A codec for packets whose messages exist already."""
+
+    def decode(self, channel, data):
+        pytest.fail(f"{channel}: read, although only its bytes are recorded")
+
+    encode = decode
+
+
+def test_in_lockstep_messages_of_other_processes_are_recorded_as_they_came(tmp_path):
+    recorder = Recorder(RecorderParameters(file=str(tmp_path / "f.mcap")))
+    recorder.warm_up()
+    values = {"odometry": state(1), "controller/status": ControllerStatus(2 * STEP, 3, "geometric", 3, 0.1, 2.0, 0.01, 0.0, 0.5, 1.0, "tracking"),
+              "trajectory": TrajectoryOrder.of(3, rest_to_rest([0, 0, 1.0], [1.0, 0, 1.0], 0.0, 0.0, 2.0, start_time=7.5))}
+    messages = {channel: topics.encode(channel, value) for channel, value in values.items()}
+    participant = LocalParticipant(recorder, codec=NoConversions())
+    participant.begin(3 * STEP, [Packet.received(channel, data, NoConversions()) for channel, data in messages.items()])
+    assert participant.results() == []
+    recorder.close()
+    assert [(topic, time, data) for topic, _, time, data in read(tmp_path / "f.mcap")] == [
+        ("/odometry", STEP, messages["odometry"]), ("/controller/status", 2 * STEP, messages["controller/status"]),
+        ("/trajectory", 2 * STEP, messages["trajectory"])]
 
 
 def test_another_namespace_than_that_of_the_recording_holds_nothing(tmp_path):

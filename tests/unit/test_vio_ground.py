@@ -72,6 +72,20 @@ def features_after_rising():
     return seen, between.min()
 
 
+@pytest.mark.parametrize("grid", [0.0, 3.6])  # on a grid of 3.6 px, many lie at the limit of 10.8 px
+def test_of_features_that_are_close_the_older_one_stays(grid):
+    pixels = np.random.default_rng(1).uniform(0, 200, (150, 2))
+    pixels = (np.round(pixels / grid) * grid if grid else pixels).astype(np.float32)
+    kept = []
+    for k in range(len(pixels)):
+        if all(np.linalg.norm(pixels[k] - pixels[other]) >= np.float32(10.8) for other in kept):
+            kept.append(k)
+    tracker = Tracker(CONFIG.tracker, MOUNT.camera)
+    tracker._pixels, tracker._ids = pixels, np.arange(len(pixels))
+    tracker._thin()
+    assert tracker._ids.tolist() == kept and 20 < len(kept) < 140
+
+
 @pytest.mark.slow
 def test_features_that_draw_together_make_room_for_others(monkeypatch):
     spread, apart = features_after_rising()

@@ -60,7 +60,7 @@ def quat_multiply(a: Array, b: Array) -> Array:
     a, b = np.asarray(a, float), np.asarray(b, float)
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[..., :3] = aw * bv + bw * av + _cross(av, bv)
+    out[..., :3] = aw * bv + bw * av + cross(av, bv)
     out[..., 3] = aw[..., 0] * bw[..., 0] - np.sum(av * bv, axis=-1)
     return out
 
@@ -74,12 +74,12 @@ def quat_rotate(q_AB: Array, v_B: Array) -> Array:
     """Rotate vectors from B to A, shapes (..., 4) and (..., 3) -> (..., 3)."""
     q_AB, v_B = np.asarray(q_AB, float), np.asarray(v_B, float)
     u, w = q_AB[..., :3], q_AB[..., 3:]
-    t = 2.0 * _cross(u, v_B)
-    return v_B + w * t + _cross(u, t)
+    t = 2.0 * cross(u, v_B)
+    return v_B + w * t + cross(u, t)
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """`np.cross` of vectors, shapes (..., 3), in a fifth of its time, most of which (30 us) is the handling of axes."""
+def cross(a: Array, b: Array) -> Array:
+    """`np.cross` of vectors, shapes (..., 3): the same bits in a third of its time, most of which (16 us) is the handling of axes."""
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     ax, ay, az, bx, by, bz = a[..., 0], a[..., 1], a[..., 2], b[..., 0], b[..., 1], b[..., 2]
     out[..., 0] = ay * bz - az * by
@@ -169,5 +169,5 @@ def nearest(A: Array) -> Array:
 def angle_between(a: Array, b: Array) -> Array:
     """Angle between vectors, accurate near 0 and pi, shapes (..., 3) -> (...) [rad]."""
     a, b = np.asarray(a, float), np.asarray(b, float)
-    angle: Array = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
+    angle: Array = np.arctan2(np.linalg.norm(cross(a, b), axis=-1), np.sum(a * b, axis=-1))
     return angle

@@ -10,7 +10,7 @@ import traceback
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -72,7 +72,7 @@ class ComponentNode(Node):
         except ConfigError:
             self.destroy_node()
             raise
-        for attribute, function in (("resolve", self.resolve_topic_name), ("host_time", self.host_time)):
+        for attribute, function in (("resolve", lru_cache(self.resolve_topic_name)), ("host_time", self.host_time)):
             if hasattr(self.component, attribute):
                 setattr(self.component, attribute, function)
         self._jobs = Jobs(lambda work, *arguments: wiring.from_thread(self.guarded, "job", work, *arguments), self.component.preload())

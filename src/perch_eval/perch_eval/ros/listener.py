@@ -70,8 +70,9 @@ class Listener(Component[C]):
         """Return a message in serialised form, whichever form the host delivers, with the time at which it is shown or recorded:
         its stamp, for `WITHOUT_STAMP` the newest stamp, or, where that is stray, the host's time."""
         if not isinstance(message, Serialized):
-            stamp = getattr(message, "stamp", 0)
-            message = Serialized(self.resolve(channel), stamp, topics.encode(channel, message), topics.message_type(channel))
+            kind = topics.message_type(channel)
+            data = message if isinstance(message, bytes) else topics.encode(channel, message)
+            message = Serialized(self.resolve(channel), topics.stamp_of(kind, data), data, kind)
         time, now = self.newest if channel in WITHOUT_STAMP else message.stamp, self.host_time()
         if time < 0 or (now and abs(time - now) > STRAY):
             if channel not in WITHOUT_STAMP and not 0 <= time <= now:  # not just late

@@ -73,7 +73,7 @@ def to_map(board: BoardPose, body: BodyState, mount: CameraMount, calibration: C
     by_shared[:3, TRANSLATION] = R_WB
     by_shared[:, INTRINSICS] = turned @ board.by_intrinsics
     w_W = R_WB @ body.w_WB_B
-    by_shared[:, TIME] = np.concatenate([body.v_WB + np.cross(w_W, p_BS_W), w_W])
+    by_shared[:, TIME] = np.concatenate([body.v_WB + so3.cross(w_W, p_BS_W), w_W])
     sigma = [*[calibration.rotation] * 3, *[calibration.translation] * 3, *calibration.lens, calibration.time_offset]
     return MapPose(body.p_WB + p_BS_W, R_WC @ board.R_CS, turned @ board.covariance @ turned.T, by_shared, np.diag(np.square(sigma)),
                    p_BS_W, body.covariance)

@@ -164,9 +164,9 @@ def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.n
     """
     z = rays_C.mean(axis=0)
     z /= np.linalg.norm(z)
-    x = np.cross((0.0, 1.0, 0.0) if abs(z[1]) < 0.9 else (1.0, 0.0, 0.0), z)
+    x = so3.cross(np.eye(3)[1 if abs(z[1]) < 0.9 else 0], z)
     x /= np.linalg.norm(x)
-    R_CV = np.stack([x, np.cross(z, x), z], axis=1)
+    R_CV = np.stack([x, so3.cross(z, x), z], axis=1)
     rays_V = rays_C @ R_CV
     if np.any(rays_V[:, 2] < 0.05):
         return []

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perch_core import so3
 from perch_core.camera import Camera
 from perch_perception.tags.edge_profile import STEPS, blur_of, fit_step, gradient_centroid, sample_profiles
 
@@ -107,7 +108,7 @@ def _refine_once(image, origin, camera, rays, modules, coarse):
     found = camera.unproject(points + offset[..., None] * normals)
     weights = np.where(np.all(np.isfinite(found), axis=-1), weights, 0.0)
     planes, line_sigma = _fit_planes(np.nan_to_num(found), weights, camera.fx, side)
-    corners = np.cross(np.roll(planes, 1, axis=1), planes)  # edge k-1 meets edge k in corner k
+    corners = so3.cross(np.roll(planes, 1, axis=1), planes)  # edge k-1 meets edge k in corner k
     sine = np.linalg.norm(corners, axis=-1)
     corners = corners / np.maximum(sine, 1e-12)[..., None]
     corners *= np.sign(np.sum(corners * rays, axis=-1, keepdims=True))

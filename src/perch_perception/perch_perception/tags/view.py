@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from perch_core import so3
 from perch_core.camera import Camera, Region
 
 GRID = 8          # the lens is evaluated on every 8th pixel; linear in between it is good to 0.01 px
@@ -50,14 +51,14 @@ class VirtualView:
             focal: desired focal length [px]; reduced where the image would exceed 640 px.
         """
         z = direction_C / np.linalg.norm(direction_C)
-        x = np.cross((0.0, 1.0, 0.0), z)
+        x = so3.cross(np.array([0.0, 1.0, 0.0]), z)
         if np.linalg.norm(x) < 1e-3:  # along the camera's y axis: any other reference will do
-            x = np.cross((1.0, 0.0, 0.0), z)
+            x = so3.cross(np.array([1.0, 0.0, 0.0]), z)
         x /= np.linalg.norm(x)
         extent = 2.0 * math.tan(min(half_angle, MAX_HALF_ANGLE))
         focal = min(focal, MAX_SIDE / extent)
         side = min(MAX_SIDE, GRID * math.ceil(focal * extent / GRID + 1))
-        return cls(np.stack([x, np.cross(z, x), z], axis=1), focal, side)
+        return cls(np.stack([x, so3.cross(z, x), z], axis=1), focal, side)
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
         """Unit rays in C of pixels of the view, shapes (..., 2) -> (..., 3)."""

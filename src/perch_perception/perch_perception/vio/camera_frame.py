@@ -52,7 +52,7 @@ def moved(X_C: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     d2 = (X_C**2).sum(axis=1, keepdims=True)
     along = (X_C * step).sum(axis=1, keepdims=True) / d2
-    S = np.exp(np.clip(along, -_MAX_LOG_STEP, _MAX_LOG_STEP))[:, :, None] * so3.exp(np.cross(X_C, step) / d2)
+    S = np.exp(np.clip(along, -_MAX_LOG_STEP, _MAX_LOG_STEP))[:, :, None] * so3.exp(so3.cross(X_C, step) / d2)
     return (S @ X_C[:, :, None])[:, :, 0], S
 
 

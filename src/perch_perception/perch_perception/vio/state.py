@@ -177,7 +177,7 @@ class State:
         """Return the change of the state per scale of the camera's path and of the points (`scale_error`), shape (size,)."""
         out = np.zeros(self.size)
         out[POSITION] = self.p_WB + self.R_WB @ self.p_BC
-        out[VELOCITY] = self.v_WB + self.R_WB @ np.cross(self.w_WB_B, self.p_BC)
+        out[VELOCITY] = self.v_WB + self.R_WB @ so3.cross(self.w_WB_B, self.p_BC)
         for pose, clone in zip(out[CORE_SIZE : self.landmark_start].reshape(-1, CLONE_SIZE), self.clones):
             pose[3:] = clone.p_WB + clone.R_WB @ self.p_BC
         if self.landmarks:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from perch_core import so3
 from perch_core.camera import Camera
 
 from perch_perception.vio.bearing import observe
@@ -186,10 +187,11 @@ class Tracker:
         least = _CROWDING * _SPACING
         if len(self._pixels) < 2:
             return
-        between = np.linalg.norm(self._pixels[:, None] - self._pixels[None], axis=2)
+        u, v = (x[:, None] - x for x in self._pixels.T)
+        close = np.tril(np.sqrt(u * u + v * v) < least, -1)  # numbers increase: older ones come first
         kept = np.ones(len(self._ids), bool)
-        for k in np.flatnonzero((np.tril(between < least, -1)).any(axis=1)):  # numbers increase: older ones come first
-            kept[k] = not (between[k, :k] < least)[kept[:k]].any()
+        for k in np.flatnonzero(close.any(axis=1)):
+            kept[k] = not close[k, kept].any()
         self._pixels, self._ids = self._pixels[kept], self._ids[kept]
 
     def _choose_reference(self, image: np.ndarray) -> None:
@@ -212,10 +214,10 @@ class Tracker:
         if len(index) < 8:
             return good
         now = observe(self.camera, after[index]).b_C
-        normals = np.nan_to_num(np.cross(rays[index], now))  # of the epipolar planes: orthogonal to the translation
+        normals = np.nan_to_num(so3.cross(rays[index], now))  # of the epipolar planes: orthogonal to the translation
         rng = np.random.default_rng(len(index))  # the same draws for the same situation: flights repeat
         pairs = rng.integers(0, len(index), (_DRAWS, 2))
-        t = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
+        t = so3.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
         length = np.linalg.norm(t, axis=1, keepdims=True)
         t = np.where(length > 1e-12, t / np.maximum(length, 1e-12), 0.0)
         inliers = np.abs(normals @ t.T) < _EPIPOLAR / self.camera.fx + slack
