@@ -59,9 +59,9 @@ def figures(quick: bool) -> list[Figure]:
             figure("random starts solved", "%", [100.0 * len(plans) / len(answers)], bar=99.5, comparison="min >=")]
     out += [figure(name, unit, [plan[name] for plan in plans]) for name, unit in END_UNITS.items()]
     anywhere = _answers(vehicle, _anywhere(vehicle, random_starts), random_starts)
-    plans = [answer for answer in anywhere if not answer["refusal"]]
+    plans = [answer for answer in anywhere if "perch_ms" in answer]
     oracle = powerline_ipopt.Oracle(vehicle, shipped_settings())
-    known = sum(oracle.perch(answer["request"]) is not None for answer in anywhere if answer["refusal"])
+    known = sum(oracle.perch(answer["request"]) is not None for answer in anywhere if "perch_ms" not in answer)
     sample = [oracle.perch(answer["request"]) is not None for answer in plans[::max(1, len(plans) // ORACLE_SAMPLE)]]
     out += [figure("starts anywhere, 0-180 deg, planned", "%", [100.0 * len(plans) / len(anywhere)]),
             figure("the same, of those that it or a multi-start IPOPT plans", "%", [100.0 * len(plans) / (len(plans) + known)], bar=99.5,
@@ -85,7 +85,7 @@ def _answers(vehicle: Vehicle, requests: Iterable[tuple[str, PowerlineRequest]],
     planner = PowerlinePlanner(vehicle, shipped_settings())
     planner.warm_up()
     answers = ({"case": case, "request": request, **_answer(planner, request)} for case, request in requests)
-    return list(with_progress(answers, total, lambda answer: not answer["refusal"], unit="starts"))
+    return list(with_progress(answers, total, lambda answer: "perch_ms" in answer, unit="starts"))
 
 
 def _of_cases(vehicle: Vehicle, starts: int) -> Iterator[tuple[str, PowerlineRequest]]:
@@ -114,15 +114,15 @@ def _anywhere(vehicle: Vehicle, starts: int) -> Iterator[tuple[str, PowerlineReq
 
 
 def _answer(planner: PowerlinePlanner, request: PowerlineRequest) -> dict:
-    """Return times, iterations and end errors of a plan, or the refusal; without a recovery, its time is nan.
+    """Return times, iterations and end errors of a plan; without a recovery, its time is nan.
 
-    `missing` is the reason why there is no plan, or none of the recovery; empty: there are both.
+    `missing` is the reason why there is no plan, the only value then, or no recovery; empty: there are both.
     """
     try:
         plan = planner.plan(request)
     except PlanningRefusal as refusal:
-        return {"refusal": str(refusal), "missing": str(refusal)}
-    return {"refusal": "", "missing": "" if plan.recovery else f"no recovery: {plan.without_recovery}",
+        return {"missing": str(refusal)}
+    return {"missing": "" if plan.recovery else f"no recovery: {plan.without_recovery}",
             "perch_ms": 1e3 * plan.perch.cpu_time, "recovery_ms": 1e3 * plan.recovery.cpu_time if plan.recovery else np.nan,
             "wall_ms": 1e3 * plan.perch.solve_time, "iterations": plan.perch.iterations,
             **{bound.quantity: bound.maximum for bound in plan.perch.bounds if bound.quantity in END_UNITS}}

@@ -432,6 +432,21 @@ def test_of_a_map_that_is_published_once_the_lines_near_the_vehicle_are_used_whe
         assert {line[1] for line in flight.component.flight.law._lines} == near
 
 
+@pytest.mark.parametrize("stamp, near", [(None, set()), (0, {3.0})])
+def test_after_a_restart_of_time_a_map_of_the_time_before_is_not_used_and_a_surveyed_one_is(stamp, near):
+    params = parameters(type="nmpc")
+    flight = Flight(100.0, replace(params, nmpc=replace(params.nmpc, lines=replace(params.nmpc.lines, collision=1e-6))))
+    flight.step(0.1)
+    line = MappedPowerline(1, (-9.0, 3.0, 2.0), (9.0, 3.0, 2.0), 0.01, np.eye(3), 0.1, 3)
+    flight.component.on_powerlines(PowerlineMap(flight.stamp if stamp is None else stamp, (line,), False, ""))
+    flight.step(1.2)
+    law = flight.component.flight.law
+    assert {line[1] for line in law._lines} == {3.0}
+    flight.stamp = 5_000_000
+    flight.step(1.2)
+    assert "time has restarted" in flight.said and {line[1] for line in law._lines} == near
+
+
 # -- laws and parameters -----------------------------------------------------------------------------------------------
 
 

@@ -187,6 +187,11 @@ def test_a_first_guess_that_is_far_too_short_leads_to_no_longer_plan_than_none(g
     assert checked(replace(problem, segment_times=guess)).duration <= checked(problem).duration
 
 
+@pytest.mark.parametrize("seed, guess", [(700110, (30.0, 1.0, 1.5)), (700112, (30.0, 1.0, 1.5))])
+def test_a_first_guess_that_is_far_off_costs_no_plan(seed, guess):
+    checked(replace(random_problem(np.random.default_rng(seed)), segment_times=guess))
+
+
 def test_certificates_enclose_what_dense_sampling_finds():
     planned = checked(PerchProblem(StartState(HOVER.p, yaw=0.6), surface(90.0)), PerchSettings(contact_delay=0.03))
     proofs = {c.quantity: c for c in planned.certificates}

@@ -46,6 +46,13 @@ def test_assembled_derivatives_are_those_of_the_chain_rule(solver: str, percepti
         np.testing.assert_allclose(np.array(ca.densify(got)), np.triu(H), rtol=1e-9, atol=1e-12 * np.abs(H).max())
 
 
+def test_the_hessian_of_a_step_takes_a_dozen_times_the_operations_of_its_gradient_and_no_more() -> None:
+    """One directional derivative for each of the 22 variables, of which only the upper triangle is computed. [tests P:eq14]"""
+    x, u, lam = ca.SX.sym("x", 18), ca.SX.sym("u", 4), ca.SX.sym("lam", 18)
+    gradient, = ca.cse([ca.gradient(ca.dot(lam, STAGES.functions["step"](x, u, 0.1)), ca.vertcat(x, u))])
+    assert STAGES.functions["step_hess"].n_instructions() < 12 * ca.Function("gradient", [x, u, lam], [gradient]).n_instructions()
+
+
 def test_clearance_constraint_is_the_scaled_distance() -> None:
     rng = np.random.default_rng(1)
     for _ in range(30):

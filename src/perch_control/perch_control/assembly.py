@@ -58,7 +58,9 @@ class Assembly:
         self._begin(choice.type, choice.adaptive)
 
     def restart(self) -> None:
-        """Begin a new flight, disarmed, with the law in use."""
+        """Begin a new flight, disarmed, with the law in use, and without lines near the vehicle until its place is known."""
+        for law in self.laws.values():
+            law.lines(())
         self._begin(self.active_law, self.flight.compensator is not None)
 
     def _begin(self, law: str, adaptive: bool) -> None:

@@ -77,6 +77,7 @@ class Controller(Component[ControllerParameters]):
         self._stamps = StampGuard()
         self._last_input_time: int | None = None  # the host's time of the last check of the watchdog after an input [ns]
         self._input_received, self._inputs_lost = False, False
+        self._map_stamp = 0                               # of the map of powerlines [ns]
         self._begin()
 
     def _begin(self) -> None:
@@ -149,6 +150,8 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"{channel}: time has restarted at {seconds(stamp):.3f} s: new flight, disarmed")
             self._assembly.restart()
             self._begin()
+            if self._map_stamp > stamp + STALE:  # of the time before; an old one, which may be published only once, stays valid
+                self._assembly.set_lines(())
         else:
             self.warn(f"{channel}: time has jumped ahead to {seconds(stamp):.3f} s")
             self.flight.descend("time has jumped ahead")
@@ -217,7 +220,7 @@ class Controller(Component[ControllerParameters]):
             return
         try:
             self._assembly.set_lines([line.segment for line in lines.lines])
-            self._map_received = True
+            self._map_received, self._map_stamp = True, lines.stamp
         except PerchError as error:
             self.warn(f"powerlines: {error}: ignored", min_interval=1.0)
 

@@ -20,7 +20,7 @@ from perch_planner.time_allocation import (
 from perch_planner.yaw_profile import yaw_coefficients
 
 STARTS = ((1.0, 100), (1.25, 75), (0.8, 75), (0.55, 50), (0.45, 40))
-"""First durations of a search, as factors of the allocated ones, and the greatest number of quadratic programs from each."""
+"""First durations of a search, as factors of the problem's `segment_times`, then of the allocated ones, and most programs from each."""
 ITERATIONS_MAX = sum(programs for _, programs in STARTS)
 _CUT_ROUNDS = 24
 _EARLY_STRETCHES = 5      # so often, peaks are stretched where a longer time helps most: high ones, and those before the last waypoint
@@ -175,10 +175,11 @@ class Search:
         From each, only longer durations are reached, in which the segments grow differently: where one start misses the durations
         that admit a plan, another may find them.
         """
-        found = []
+        found: list[Found] = []
         for factor, programs in STARTS:
             self._iterations_end = min(self.iterations + programs, self._iterations_max)
-            found.append(self._run_from(with_last_segment(factor * self.initial_durations, self.settings)))
+            first = allocate(replace(self.problem, segment_times=None), self.settings, self.contact.points) if found else self.initial_durations
+            found.append(self._run_from(with_last_segment(factor * first, self.settings)))
             if found[-1].outcome.proved:
                 return found[-1]
             if self.iterations >= self._iterations_max:

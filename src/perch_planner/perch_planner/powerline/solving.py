@@ -29,7 +29,7 @@ PHASES: dict[str, dict[str, Any]] = {
     "gauss_newton": {"tolerance": 0.3, "max_iterations": 24, "gauss_newton": True},
     "solve": {"tolerance": 1e-3, "barrier": 1e-2, "max_iterations": 100},
     "trial": {"tolerance": 1e-3, "barrier": 1e-2, "max_iterations": 50},
-    "refine": {"tolerance": 1e-4, "barrier": 1e-4, "push": 1e-4},
+    "refine": {"tolerance": 1e-3, "barrier": 1e-4, "push": 1e-4},
 }
 IPOPT_ITERATIONS = 300  # of IPOPT, which is tried last
 END_SHARE = 0.2          # of the required accuracy at the end: the tolerance of the program there

@@ -233,10 +233,10 @@ def stage_functions(model: StageModel) -> StageFunctions:
     for name, (variables, parameters, value) in expressions.items():
         z, inputs = ca.vertcat(*variables), variables + parameters
         lam = ca.SX.sym("lam", value.shape[0])
-        J = ca.jacobian(value, z)
-        weighted = ca.dot(lam, value)
-        gradient = ca.gradient(weighted, z)
-        H = ca.triu(ca.hessian(weighted, z)[0])
+        value, = ca.cse([value])
+        J, = ca.cse([ca.jacobian(value, z)])
+        gradient, = ca.cse([ca.gradient(ca.dot(lam, value), z)])
+        H = ca.triu(ca.jacobian(gradient, z))  # without the lower triangle: three quarters of the operations of `ca.hessian`
         differentiable = [i < len(variables) for i in range(len(inputs))]
         functions[name] = ca.Function(name, inputs, [value], {"is_diff_in": differentiable})
         functions[f"{name}_jac"] = ca.Function(f"{name}_jac", inputs, [_nonzeros(J)])
