@@ -45,7 +45,7 @@ class Renderer:
         Args:
             scene: scene to render; renderers of the same `Scene` object share its textures.
             mount: the camera and its pose on the body; `mount.colour` selects rgb8.
-            seed: seed of the sensor's noise bank, which each camera has for itself.
+            seed: seed of the sensor's noise bank.
         """
         self.scene, self.mount = scene, mount
         self.exposure = control_exposure(mount, scene.light)
@@ -55,7 +55,7 @@ class Renderer:
         self._raster = Rasterizer(self._faces, build_atlas(scene), mount.camera, self._grid)
         self._cables = CablePainter(scene.cables, mount.camera) if scene.cables else None
         self._tint = np.rint(TINT).astype(np.uint8)[None]
-        self._sensor = Sensor(mount.camera, self.exposure, 3 if mount.colour else 1, seed, mount.name)
+        self._sensor = Sensor(mount.camera, self.exposure, 3 if mount.colour else 1, seed)
 
     def render(self, poses: Sequence[Pose], rng: np.random.Generator, target_shift: np.ndarray = np.zeros(3),
                region: Region | None = None) -> np.ndarray:

@@ -13,7 +13,6 @@ import numpy as np
 
 from perch_core.camera import Camera, Region
 from perch_core.camera_mount import CameraMount
-from perch_sim.seeding import stream
 
 BLUR_REACH = 2   # of the filter that stands for it [px]
 PSF_SIGMA = 0.6  # blur of lens and pixel together [px]
@@ -49,10 +48,10 @@ def control_exposure(mount: CameraMount, light: float) -> Exposure:
 
 
 class Sensor:
-    """Imperfections of a camera, determined by a seed and its name; has no mutable state."""
+    """Imperfections of a camera, determined by a seed; has no mutable state."""
 
-    def __init__(self, camera: Camera, exposure: Exposure, channels: int, seed: int, name: str = "") -> None:
-        rng = stream(seed, f"noise_bank_{name}")
+    def __init__(self, camera: Camera, exposure: Exposure, channels: int, seed: int) -> None:
+        rng = np.random.default_rng([seed, 1])
         u, v = np.meshgrid(np.arange(camera.width) - camera.cx, np.arange(camera.height) - camera.cy)
         radius = np.hypot(u, v)
         vignette = (1.0 - VIGNETTE * (radius / radius.max()) ** 2) * exposure.brightness
