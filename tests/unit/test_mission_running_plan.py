@@ -58,6 +58,7 @@ def test_ways_out_start_from_the_plans_own_states_until_its_own_recovery_is_near
             assert ready is not None and better is None
             starts.append(query.start_time)
         time += 0.02
+    assert starts[-1] == pytest.approx(plan.plan.end - SETTINGS.way_out_until), "the last one is as late as it may be"
     gaps = np.diff([START, *starts, plan.plan.end])
     assert len(starts) >= 4 and gaps.max() < 0.65, "an abort finds one within the time that the controller flies on"
 
