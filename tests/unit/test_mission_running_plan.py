@@ -84,6 +84,13 @@ def test_the_last_way_out_leaves_the_wire_from_where_the_vehicle_is_beside_the_n
     np.testing.assert_allclose(query.state.rotor_thrust, at_wire.rotor_thrust)
 
 
+def test_a_way_out_that_is_answered_after_its_start_does_not_count():
+    plan = running()
+    query = plan.query(START, AT_REST, None, GOAL)
+    assert plan.answered(answer(query.start_time, 1.0), query.start_time + 0.02) == (None, None)
+    assert plan.ways_out.committed(plan.plan.end - 0.1) == "the planner answered too late"
+
+
 def test_a_target_that_has_moved_is_perched_on_where_it_is_now():
     plan = running()
     query = plan.query(START + 0.1, AT_REST, target(10.0, x=5.26), GOAL)

@@ -92,9 +92,10 @@ class RunningPlan:
         query, self._pending_query = self._pending_query, None
         if query is None:
             return None, None
+        refusal = plan.message if isinstance(plan, Refusal) else "the planner answered too late" if plan.start_time <= time else ""
         if query.recovery:
-            self.ways_out.answered(query.start_time, plan.message if isinstance(plan, Refusal) else "")
-        if isinstance(plan, Refusal) or plan.start_time <= time:
+            self.ways_out.answered(query.start_time, refusal)
+        if isinstance(plan, Refusal) or refusal:
             return None, None
         if query.recovery:
             return plan, None
