@@ -269,7 +269,7 @@ def test_the_page_of_faults_says_what_the_planner_is_given(tmp_path, monkeypatch
 def test_few_inspections_without_a_collision_do_not_show_what_many_do(tmp_path, monkeypatch, count, collisions, verdict):
     def known(effort, name, jobs, fly, good):
         return [{"seed": seed, "reference_collisions": 2, "collisions": collisions * (seed == 1), "collisions_without": 2, "reference_px": 100.0,
-                 "flown_px": 10.0, "clearance": 1.0, "cheirality": 1.0, "segment": 1.0, "completed": True} for seed in jobs]
+                 "flown_px": 10.0, "clearance": 1.0, "cheirality": 1.0, "segment": 1.0, "completed": True, "mapped": 3, "lines": 3} for seed in jobs]
 
     monkeypatch.setattr(inspection, "cached_figures", known)
     section = inspection._layouts(Effort(True, 1, tmp_path, tmp_path, "test", range(1, 2), range(1, 2), count, {}))

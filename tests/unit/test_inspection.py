@@ -9,12 +9,12 @@ import pytest
 from perch_control.mission import ControllerState, Goal, InspectionMission, Inputs, MissionSettings, Phase, Result, State, Target
 from perch_control.mission.waypoints import waypoint_lines
 from perch_control.nmpc import LineWeights, chosen_lines
-from perch_core import config
+from perch_core import config, so3
 from perch_core.errors import ConfigError, PerchError
 from perch_core.lines import Segment
 from perch_core.vehicle import load_vehicle
 from perch_eval.in_process.parameters import NodeParameters
-from perch_eval.inspection.flight import fly
+from perch_eval.inspection.flight import fly, heading_along
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.layout import random_layout
 from perch_eval.inspection.measures import clearance, collisions, inspection_result, judge, reference_of, reference_states, segments, watched
@@ -60,6 +60,19 @@ def test_layouts_repeat_and_their_reference_collides_twice_and_looks_past_the_li
     assert collisions(clearance(states, lines, RADII)) == 2
     assert judge(states, lines, watched(layout, lines), load_vehicle("rpg")).reprojection > 60.0
     assert collisions(clearance(states[[0, -1]], lines, RADII)) == 0
+
+
+@pytest.mark.parametrize("seed", [5, 8, 11])
+def test_a_turn_along_the_waypoints_at_the_first_one_shows_the_cables_that_cross_them(seed):
+    layout, mount = random_layout(BASE, seed), load_vehicle("rpg").mounts["front"]
+
+    def seen(yaw):
+        p_WC, R_WC = mount.pose(np.array(layout.inspection.waypoints[0].position), so3.exp(np.array([0.0, 0.0, yaw])))
+        views = (mount.camera.project((np.linspace(*cable.ends, 41) - p_WC) @ R_WC) for cable in segments(layout))
+        return {k for k, (pixels, valid) in enumerate(views) if np.any(valid & mount.camera.contains(pixels))}
+
+    at_first = math.radians(layout.inspection.waypoints[0].yaw_deg)
+    assert len(seen(at_first)) < 3 and set().union(*map(seen, np.linspace(at_first, heading_along(layout), 9))) == {0, 1, 2}
 
 
 def test_collisions_are_counted_by_their_beginnings():
@@ -141,7 +154,7 @@ def test_the_line_terms_avoid_the_collision_and_keep_the_line_centred():
     flight = fly(scenario, 1)
     assert not flight.message and flight.collisions == 0 and flight.reference.collisions == 1
     assert flight.reference.reprojection > 5.0 * flight.flown.reprojection
-    assert flight.flown.visibility.cheirality.all()
+    assert flight.flown.visibility.cheirality.all() and flight.mapped == 3
     assert flight.times[-1] == pytest.approx(reference_of(scenario).duration, abs=0.05)
 
 

@@ -478,6 +478,18 @@ def test_a_wire_is_asked_for_flown_and_left_by_ways_out():
     assert any(o.at_end == 0 and isinstance(o.trajectory, SampledTrajectory) and o.id == perch.id for o in world.orders), "a way out, of the same number"
 
 
+@pytest.mark.parametrize("left, message", [
+    (0.35, "cancelled"), (0.2, "cancelled too late, unless the gripper fails: the contact may come at any moment")])
+def test_cancelled_when_no_way_out_is_left_the_wire_is_the_goals_end_unless_the_gripper_fails(left, message):
+    world = Wires().send().run(60.0, until=lambda w: any(o.at_end == 3 for o in w.orders))
+    contact = next(o.trajectory.start_time + 2.0 for o in world.orders if o.at_end == 3)
+    world.run(until=lambda w: seconds(w.stamp) > contact - left)
+    world.goal.cancel_requested = True
+    world.run(0.05)
+    assert world.goal.told[-1].message == message
+    assert world.commands[-1] is Command.HOVER, "the recovery follows where the gripper has not closed"
+
+
 PATH = rest_to_rest(np.zeros(3), SURFACE.p_WS, 0.0, 0.0, 3.0, start_time=20.0)
 
 

@@ -58,6 +58,7 @@ def test_ways_out_start_from_the_plans_own_states_until_its_own_recovery_is_near
             assert ready is not None and better is None
             starts.append(query.start_time)
         time += 0.02
+    assert starts[-1] == pytest.approx(plan.plan.end - SETTINGS.way_out_until), "the last one is as late as it may be"
     gaps = np.diff([START, *starts, plan.plan.end])
     assert len(starts) >= 4 and gaps.max() < 0.65, "an abort finds one within the time that the controller flies on"
 
@@ -81,6 +82,13 @@ def test_the_last_way_out_leaves_the_wire_from_where_the_vehicle_is_beside_the_n
     np.testing.assert_allclose(query.state.v, at_wire.v + [0.1, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(query.state.q, so3.quat_multiply(turn, at_wire.q), atol=1e-9)
     np.testing.assert_allclose(query.state.rotor_thrust, at_wire.rotor_thrust)
+
+
+def test_a_way_out_that_is_answered_after_its_start_does_not_count():
+    plan = running()
+    query = plan.query(START, AT_REST, None, GOAL)
+    assert plan.answered(answer(query.start_time, 1.0), query.start_time + 0.02) == (None, None)
+    assert plan.ways_out.committed(plan.plan.end - 0.1) == "the planner answered too late"
 
 
 def test_a_target_that_has_moved_is_perched_on_where_it_is_now():

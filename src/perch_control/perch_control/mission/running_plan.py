@@ -34,12 +34,12 @@ class RunningPlan:
         plan: the plan being flown.
         target: the target that it was made for.
         states: states of the plan, with unit quaternions.
-        ways_out: ways out of the plan; closer to the contact, the plan's own recovery is the way out.
+        ways_out: ways out of the plan; closer to the contact, the plan's own recovery is the way out, unless the gripper closes before.
     """
 
     def __init__(self, plan: Plan, target: Target, settings: MissionSettings, states: SampledTrajectory, replanned_at: float = -math.inf) -> None:
         self.plan, self.target, self.states = plan, target, states
-        self.ways_out = WaysOut(plan.start_time, plan.end - settings.way_out_until, settings.way_out_spacing)
+        self.ways_out = WaysOut(plan.start_time, plan.end - settings.way_out_until, settings.way_out_spacing, closing=True)
         self._settings, self._replanned_at = settings, replanned_at
         self._pending_query: PlanQuery | None = None
         self._departure_requested = False  # the way out from the wire has been requested
@@ -92,9 +92,10 @@ class RunningPlan:
         query, self._pending_query = self._pending_query, None
         if query is None:
             return None, None
+        refusal = plan.message if isinstance(plan, Refusal) else "the planner answered too late" if plan.start_time <= time else ""
         if query.recovery:
-            self.ways_out.answered(query.start_time, plan.message if isinstance(plan, Refusal) else "")
-        if isinstance(plan, Refusal) or plan.start_time <= time:
+            self.ways_out.answered(query.start_time, refusal)
+        if isinstance(plan, Refusal) or refusal:
             return None, None
         if query.recovery:
             return plan, None

@@ -29,7 +29,7 @@ class MissionSettings:
     planner_latency: float = quantity(0.04, unit="s", low=0.0, high=5.0, doc="a plan is used this long after its request")
     powerline_latency: float = quantity(1.0, unit="s", low=0.0, high=10.0, doc="the same for a powerline plan")
     way_out_spacing: ClassVar[float] = 0.3  # between the starts of recoveries that are kept ready [s]
-    way_out_until: ClassVar[float] = 0.3  # closer to the contact the plan's own recovery is the way out [s]
+    way_out_until: ClassVar[float] = 0.3  # from the last of them to the contact: the wire is still beyond the gripper's reach [s]
     powerline_replan_period: ClassVar[float] = 0.35  # [s]
     powerline_replan_until: ClassVar[float] = 0.5  # no new plan starts closer than this to the contact [s]
     shift_distance: ClassVar[float] = 0.004  # ... where the wire has moved by more than this ... [m]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from perch_control.mission.values import TICK
+
 DECISION = 0.04  # from an answer to the start of what it brings: the mission's latency and a tick [s]
 
 
@@ -16,6 +18,7 @@ class WaysOut:
         covered: start of the last one that was answered [s]; the next one begins at least `spacing` later.
         until: every start is before this time [s].
         spacing: least time between two starts [s].
+        closing: whether one more begins at `until`, less than `spacing` after the one before.
         last: start of the latest one that was found [s].
         refusal: why the one at `covered` was refused; empty: it was not.
     """
@@ -23,13 +26,16 @@ class WaysOut:
     covered: float
     until: float
     spacing: float
+    closing: bool = False
     last: float = -math.inf
     refusal: str = ""
 
     def next(self, soonest: float) -> float | None:
         """Return the start of the next one to request [s], not before `soonest`; None: all have been requested."""
         start = max(soonest, self.covered + self.spacing)
-        return start if start < self.until else None
+        if start < self.until:
+            return start
+        return self.until if self.closing and max(soonest, self.covered + TICK) <= self.until else None
 
     def answered(self, start: float, refusal: str) -> None:
         """Take the answer to the request for the one that begins at `start` [s]; an empty refusal: it was found."""

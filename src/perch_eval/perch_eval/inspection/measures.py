@@ -99,6 +99,7 @@ class InspectionResult:
         lines, line: the true lines, and the watched one.
         crashes: number of collisions that the plant reports.
         message: why the flight ended early; empty: it was completed.
+        mapped: number of lines in the map at the start of the reference: others can be avoided only if they come into view in time.
     """
 
     times: np.ndarray
@@ -111,6 +112,7 @@ class InspectionResult:
     line: Segment
     crashes: int
     message: str
+    mapped: int
 
     @property
     def collisions(self) -> int:
@@ -118,13 +120,14 @@ class InspectionResult:
         return max(self.flown.collisions, self.crashes)
 
 
-def inspection_result(scenario: Scenario, times: np.ndarray, states: np.ndarray, crashes: int = 0, message: str = "") -> InspectionResult:
+def inspection_result(scenario: Scenario, times: np.ndarray, states: np.ndarray, crashes: int = 0, message: str = "",
+                      mapped: int = 0) -> InspectionResult:
     """Compute the measures of a scenario's flight; arguments as the fields of `InspectionResult`."""
     vehicle, lines = load_vehicle(scenario.vehicle), segments(scenario)
     line = watched(scenario, lines)
     reference_times, reference = reference_states(scenario)
     return InspectionResult(times, states, judge(states, lines, line, vehicle), reference_times, reference,
-                            judge(reference, lines, line, vehicle), lines, line, crashes, message)
+                            judge(reference, lines, line, vehicle), lines, line, crashes, message, mapped)
 
 
 def recorded_inspection(flight: Flight, scenario: Scenario, message: str = "") -> InspectionResult | None:
@@ -145,6 +148,7 @@ def recorded_inspection(flight: Flight, scenario: Scenario, message: str = "") -
     states = np.column_stack([truth.p, truth.q])[during][::DOWNSAMPLING]
     if len(states) < 2:
         return None
+    maps = [lines for time, lines in flight.values("powerlines") if time <= trajectory.start_time]
     crashes = [c for _, c in flight.values("contact") if c.state == ContactState.COLLISION]
     return inspection_result(scenario, truth.t[during][::DOWNSAMPLING] - trajectory.start_time, states, len(crashes),
-                             "; ".join(c.reason for c in crashes) or message)
+                             "; ".join(c.reason for c in crashes) or message, len(maps[-1].lines) if maps else 0)
