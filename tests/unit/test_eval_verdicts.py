@@ -63,11 +63,13 @@ def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch)
     assert set(verdicts(ways_out.sections(effort)[0]).values()) == {"fails"}
 
 
-@pytest.mark.parametrize("before, planned, verdict", [(0.1, False, "holds"), (0.1, True, "fails"), (0.35, True, "fails"), (0.35, False, "fails")])
-def test_a_cancelled_flight_is_attached_for_good_only_where_it_was_too_late(effort, monkeypatch, before, planned, verdict):
+@pytest.mark.parametrize("before, message, verdict", [
+    (0.1, "cancelled too late: perched", "holds"), (0.1, "cancelled", "fails"), (0.35, "cancelled", "fails"),
+    (0.35, "cancelled too late: perched", "fails")])
+def test_a_cancelled_flight_is_attached_for_good_only_where_it_was_too_late(effort, monkeypatch, before, message, verdict):
     def rows(effort, name, jobs, work, good):
-        flown = [{"scenario": s, "seed": n, "before": before, "planned": planned, "end": "attached", "message": "", "rate": 1.0, "margin": 0.1,
-                  "distance": 1.0, "settled": 0.1} for s, n, _ in jobs] if name == "aborted" else []
+        flown = [{"scenario": s, "seed": n, "before": before, "planned": False, "end": "attached", "message": message, "rate": 1.0,
+                  "margin": 0.1, "distance": 1.0, "settled": 0.1} for s, n, _ in jobs] if name == "aborted" else []
         assert all(good(r) == (verdict == "holds") for r in flown)
         return flown
 

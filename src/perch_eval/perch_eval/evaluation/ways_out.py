@@ -36,10 +36,10 @@ INCLINATIONS = (60, 90, 120)                              # [deg]
 LINES = ("line_20", "line_20_pa", "line_80", "line_80_pa", "line_180")
 PLANS = 20                                                # of each
 EDGES = (0.0, 0.05, 0.1, 0.15, 0.3, 0.5, 0.7, 1.0, math.inf)  # of time to contact [s]
-CANCELLED_FLIGHTS = {"surface_60": 8, "surface_90": 12, "line_80": 2}  # flights that are cancelled, each at another time
+CANCELLED_FLIGHTS = {"surface_60": 8, "surface_90": 12, "line_80": 8}  # flights that are cancelled, each at another time
 MAX_TIME_TO_CONTACT = 1.4                                 # at which the first of them is cancelled [s]
 NO_CONTACT_BEFORE = MissionSettings().contact_early       # nearer to the contact a surface may already be touched [s]
-TOO_LATE = NO_CONTACT_BEFORE + DECISION                   # cancelled nearer to the contact, no way out can begin in time [s]
+LAST_WAY_OUT = {"surface": NO_CONTACT_BEFORE, "line": MissionSettings.way_out_until}  # before the contact [s]
 REQUIRED_SHARE = 0.99                                     # share of the instants before that with a way out
 INTERVAL = re.compile(r"\[(\S+), (\S+)\]")  # that was found, in a refusal
 
@@ -79,7 +79,8 @@ def sections(effort: Effort) -> list[Section]:
             "## Refused", ""]
     text += _counted(reasons) or ["None."]
     text += ["", "## Cancelled flights", "", "The goal is cancelled on the way (modelled cameras, seeds from 1). *by a way out*: the controller left the "
-             f"plan by a planned way out; *too late*: cancelled within {TOO_LATE:g} s of the contact, no way out was planned, and the perch went on.", ""]
+             f"plan by a planned way out; *too late*: cancelled within {_too_late_at('surface'):g} s of the contact with a surface or "
+             f"{_too_late_at('line'):g} s of that with a wire, no way out was left, and the mission says so.", ""]
     rows = []
     for name, n in CANCELLED_FLIGHTS.items():
         own = [r for r in flown if r["scenario"] == name]
@@ -92,7 +93,8 @@ def sections(effort: Effort) -> list[Section]:
                   len(hovering) + late == n, "; ".join(("all; too late: see [way_out.md](way_out.md)", *others)))
     text += table("scenario | n | hovering | of these by a way out | attached, too late | other | least thrust margin | largest body rate [rad/s]", rows)
     text += ["", *table("scenario | seed | cancelled before contact [s] | end | by a way out | goal ended after [s] | message of the mission", (
-        (r["scenario"], r["seed"], f"{r['before']:.2f}", r["end"], "yes" if r["planned"] else "no", f"{r['settled']:.2f}", r["message"]) for r in flown))]
+        (r["scenario"], r["seed"], f"{r['before']:.2f}", r["end"], "yes" if r["planned"] and r["end"] == "hovering" else "no", f"{r['settled']:.2f}",
+         r["message"]) for r in flown))]
     write_page(effort, "way_out", text, {"plans": made, "flights": flown})
     out.data = {"plans": made, "flights": flown}
     return [out]
@@ -126,9 +128,14 @@ def _cancellations() -> Iterator[tuple[str, int, float]]:
             yield name, k + 1, round(MAX_TIME_TO_CONTACT * (1.0 - (k + 0.5) / n), 3)
 
 
+def _too_late_at(scenario: str) -> float:
+    """Return the time to contact from which on no way out can begin in time after a decision [s]."""
+    return LAST_WAY_OUT[scenario.partition("_")[0]] + DECISION
+
+
 def _too_late(r: dict[str, Any]) -> bool:
-    """Return whether a flight is attached because it was cancelled when no way out could begin before the contact."""
-    return r["end"] == "attached" and r["before"] < TOO_LATE and not r["planned"]
+    """Return whether a flight is attached, as the mission says it is, because no way out could begin before the contact."""
+    return r["end"] == "attached" and r["before"] < _too_late_at(r["scenario"]) and r["message"].startswith("cancelled too late")
 
 
 def _fly_cancelled(job: tuple[str, int, float]) -> dict[str, Any]:
