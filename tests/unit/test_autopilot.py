@@ -336,8 +336,11 @@ def test_a_node_that_is_started_obeys_commands_to_arm_only_after_one_with_the_mo
     assert obeyed(node, True) is armed
     said = polled(node, 1.0, 200, 9.81)
     assert said == ([] if armed else ["the autopilot refuses to arm: this node was started: disarm first"])
+    monkeypatch.setattr(StubAutopilot, "armed", True)    # by its pilot
+    polled(node, 3.0, 50, 9.81)
     node._link.ended = True
-    polled(node, 3.0, 1, 9.81)
+    polled(node, 4.0, 1)
+    assert bool([word for word in node._link.told if word not in ("kill", "turning")]) is armed
     assert obeyed(node, True) is armed
     assert not obeyed(node, False) and obeyed(node, True)
 

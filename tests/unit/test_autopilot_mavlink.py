@@ -7,6 +7,7 @@ import socket
 
 import numpy as np
 import pytest
+from perch_autopilot.arming import Arming, Stop
 from perch_autopilot.link import Link, LinkError
 from perch_autopilot.mavlink import ClockOffset, Mavlink, MavlinkParameters
 from perch_autopilot.offboard import ARDUPILOT, ARMED, GUIDED_NOGPS, OFFBOARD, PX4, Offboard, Request
@@ -75,6 +76,29 @@ def test_a_disarm_and_an_arm_between_two_heartbeats_arm():
         requests.append((now, machine.next_request(now, wanted, True)))
     assert [(pytest.approx(now), request) for now, request in requests if request is not Request.NOTHING] == [
         (1.1, Request.DISARM), (2.1, Request.ARM)]
+
+
+def test_a_pilot_who_disarms_right_after_the_controller_is_armed_is_obeyed():
+    """The node has not requested that, though no heartbeat has come since commands have the motors on."""
+    machine = Offboard(autopilot=PX4)
+    requests = []
+    for k in range(500):
+        now, wanted = 0.01 * k, k >= 110
+        if k % 100 == 0:
+            machine.heartbeat(now, PX4, ARMED * (k < 150), OFFBOARD)
+        machine.arming.command(now, wanted)
+        obeyed = machine.obeys(wanted)
+        requests.append(machine.next_request(now, wanted and obeyed, obeyed))
+    assert set(requests) == {Request.NOTHING} and machine.arming.stop is Stop.AUTOPILOT
+
+
+def test_kill_is_what_stops_the_motors_when_a_report_from_before_it_comes_late():
+    arming = Arming()
+    arming.command(0.0, True)
+    arming.halt(Stop.KILL)
+    arming.command(1.0, True)
+    assert not arming.report(1.1, True) and not arming.report(2.1, False)
+    assert arming.stop is Stop.KILL
 
 
 @pytest.mark.parametrize("armed", [False, True])

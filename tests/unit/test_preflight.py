@@ -159,18 +159,23 @@ class Graph:
 
     def __init__(self, obeys=True):
         self.commands, self.obeys = [], obeys
+        self._killed = False  # since the autopilot's last report, once a second
 
     def send_command(self, sent, state):
+        self._killed |= sent == command.Command.KILL
         self.commands.append(sent)
         status = ControllerStatus(0, state if self.obeys else 0, "geometric", 0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, "said")
         return CommandResult(status, 0.1, state == command.State.ARMED and self.obeys)
 
+    def spin_for(self, duration):
+        self._killed &= duration <= 1.0 or self.commands[-1] != command.Command.DISARM
+
     def await_takeover(self, timeout):
-        assert self.commands[-1] == command.Command.ARM
+        assert self.commands[-1] == command.Command.ARM and not self._killed
         return True, True
 
     def await_end_of_commands(self, timeout):
-        assert self.commands[-1] == command.Command.ARM
+        assert self.commands[-1] == command.Command.ARM and not self._killed
         return 10.0, 10.4
 
 

@@ -31,7 +31,7 @@ class Arming:
 
     stop: Stop | None = None
     wanted: bool | None = None
-    _was_armed: bool = False        # reported since commands have the motors on
+    _was_armed: bool = False        # reported while commands with the motors on were obeyed
     _disarmed: bool = False         # reported since the stop
     _disarmed_reports: int = 0      # in a row
     _last_off: float = -1e9         # time of the last command with the motors off [s]
@@ -68,7 +68,7 @@ class Arming:
         """
         self._disarmed_reports = 0 if armed else self._disarmed_reports + 1
         if armed:
-            self._was_armed |= bool(self.wanted) and not 0.0 <= now - self._last_off < LATENCY
+            self._was_armed |= self.stop is None and bool(self.wanted) and not 0.0 <= now - self._last_off < LATENCY
         elif self._was_armed and self._disarmed_reports >= needed:
             self.halt(stop)
             self._disarmed = True

@@ -173,7 +173,7 @@ class Betaflight(Component[BetaflightParameters]):
         elif self._status is not None and self._status.armed:
             if self._lifted or not self._arming.wanted:
                 link.report_motors_turning()
-            if self._arming.wanted:
+            if self._arming.wanted and self._arming.stop is None:
                 link.command(True, self._sticks.channels((0.0, 0.0, 0.0), GRAVITY) if self._lifted else CENTRED)
 
     def _handle_frame(self, frame: msp.Frame, now: int) -> None:

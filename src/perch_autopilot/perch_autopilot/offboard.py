@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 
-from perch_autopilot.arming import Arming, Stop
+from perch_autopilot.arming import LATENCY, Arming, Stop
 
 PX4, ARDUPILOT = 12, 3              # MAV_AUTOPILOT
 ARMED = 128                         # MAV_MODE_FLAG_SAFETY_ARMED
@@ -125,6 +125,8 @@ class Offboard:
             self.forced = self.forced and self.armed
         elif self.armed:
             self.forced = True
+            if self._last_heartbeat - self._last_request >= LATENCY:  # no request can have disarmed it since
+                self.arming.report(now, True)
         elif self.arming.stop is None and self._streaming_since is not None and now - self._streaming_since >= MIN_STREAMING_TIME:
             request = Request.ARM if self.following else Request.MODE
         if request is Request.NOTHING or 0.0 <= now - self._last_request < REQUEST_PERIOD:

@@ -26,6 +26,7 @@ EXAMPLES = """examples:
 
 exit code: 0 nothing has failed, 1 something has, 2 wrong arguments"""
 USER_TIMEOUT = 60.0  # for an action by hand [s]
+REPORT_TIME = 1.5    # for the autopilot to report that it is disarmed, before which a KILL is not over: MAVLink's heartbeats come once a second [s]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -102,6 +103,7 @@ def _props_off_checks(listener: Any, arguments: argparse.Namespace, bound: float
         listener.send_command(Command.ARM, State.ARMED)
         found.append(checks.check_command("kill", listener.send_command(Command.KILL, State.FAILED), State.FAILED, False))
         listener.send_command(Command.DISARM, State.DISARMED)
+        listener.spin_for(REPORT_TIME)
         if arguments.takeover and listener.send_command(Command.ARM, State.ARMED).armed:
             print(f"armed: pilot, your arming switch off, then take over (within {USER_TIMEOUT:g} s) ...", flush=True)
             takeover = listener.await_takeover(USER_TIMEOUT)
