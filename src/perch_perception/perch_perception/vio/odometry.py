@@ -192,7 +192,7 @@ class VisualInertialOdometry:
         if rests:
             self._store_pose()
             self._begin_motion_start()
-            self.filter, self._at_rest = None, False
+            self.filter, self._at_rest, self._at_configured_start = None, False, False
         elif self.filter is not None:
             self._drop_filter(_UNSEEN_SPEED if self._at_rest else 0.0)
         if moved:
@@ -244,13 +244,15 @@ class VisualInertialOdometry:
 
         With odometry, or after a loss in motion, it may hover, where for moments either looks like rest: the IMU must be quiet and
         the image static for long, or, without an image, the vehicle lean or be known to rest by the odometry. The biases of an
-        earlier filter do not count: they may be why it was lost. Odometry that cannot be used leaves the configured start.
+        earlier filter do not count: they may be why it was lost. Odometry that cannot be used leaves the configured start. A vehicle
+        that rested before its camera was silent or replaced may have left: what the image shows, it must show for long.
         """
         for_long, moving = self._recent_views.is_static(STATIC_DURATION), self._last_pose.known_at is not None
         if moving or self._odometry:
             unseen = for_long is None and (not moving or self._odometry_rests or leans(steps))
             return bool(for_long or unseen) and is_at_rest(steps)
-        return self._recent_views.is_static() is not False and is_at_rest(steps, image_is_static=bool(for_long))
+        static = self._recent_views.is_static() if self._at_configured_start else for_long
+        return static is not False and is_at_rest(steps, image_is_static=bool(for_long))
 
     def _take_odometry(self, exposure: int) -> None:
         """Make the newest odometry before an exposure the known pose."""
