@@ -27,14 +27,18 @@ def textured(rng, noise=2.0):
     return lambda frame: some[frame % 4]
 
 
-def outcomes(climb, drop, until=2.6):
-    """Frames over a blank floor: rest for 1 s, `climb` and `drop` [m/s^2] for 0.1 s each, then nothing more; (time, outcome, height)."""
+def outcomes(climb, drop, until=2.6, idle=0.0):
+    """Frames over a blank floor: rest for 1 s, `climb` and `drop` [m/s^2] for 0.1 s each, then nothing more; (time, outcome, height).
+
+    Rotors shake the vehicle from the end of the rest for a time `idle` [s].
+    """
     rng, mount = np.random.default_rng(1), load_vehicle("snapdragon").mounts["down"]
     vio, out, frame, image = VisualInertialOdometry(VioConfig(), mount), [], 0.1, blank(rng)
     for k in range(round(until / 0.002)):
         t = 0.002 * k
         up = 9.81 + (climb if 1.0 <= t < 1.1 else drop if 1.1 <= t < 1.2 else 0.0)
-        vio.add_imu(ImuSample(k * 2 * MS, tuple(rng.normal(0, 0.002, 3)), tuple(rng.normal(0, 0.05, 3) + [0, 0, up])))
+        shake = 1.0 if 1.0 <= t < 1.0 + idle else 0.05
+        vio.add_imu(ImuSample(k * 2 * MS, tuple(rng.normal(0, 0.002, 3)), tuple(rng.normal(0, shake, 3) + [0, 0, up])))
         if t > frame + 0.02:
             result = vio.add_image(round(frame * 1e9), image(len(out)))
             out.append((frame, result.outcome, vio.filter.state.p_WB[2] if vio.filter else 0.0))
@@ -48,6 +52,15 @@ def test_a_shake_on_the_ground_is_rest_again():
     assert {o for t, o, _ in seen if 0.5 < t < 1.0} == {FrameOutcome.RESTING}
     assert any(o is not FrameOutcome.RESTING for t, o, _ in seen if 1.0 < t < 1.3)
     assert {o for t, o, _ in seen if t > 1.8} == {FrameOutcome.RESTING}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("climb, rests", [(0.0, True), (6.0, False)])
+def test_rotors_that_idled_on_the_ground_in_the_dark_leave_it_at_rest_a_take_off_does_not(climb, rests):
+    """For longer than vision may be missing at a take-off."""
+    seen = outcomes(climb, -climb, until=4.0, idle=1.6)
+    assert any(o is FrameOutcome.BLIND for t, o, _ in seen if 2.0 < t < 2.6)
+    assert {o for t, o, _ in seen if t > 3.0} == {FrameOutcome.RESTING if rests else FrameOutcome.BLIND}
 
 
 def test_a_steady_climb_is_not_rest():

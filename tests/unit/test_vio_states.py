@@ -241,6 +241,22 @@ def test_a_quiet_imu_is_no_rest_where_it_may_be_a_hover(rests, pixels, case):
     assert (FrameOutcome.RESTING in unaccelerated(pixels, **case)) is rests
 
 
+@pytest.mark.parametrize("drift, rests", [(0.0, True), (2.5, False)])
+def test_after_images_were_missing_a_rest_is_one_in_the_image_for_long(drift, rests):
+    """It may have left its place meanwhile, and hover; `drift` is that of the tracks [px/s]."""
+    rng, vio, out, frame = np.random.default_rng(3), VisualInertialOdometry(VioConfig(), MOUNT, floor=-0.04), [], 0.3
+    vio.tracker = GivenTracks(lambda: (np.arange(len(SEEN)), SEEN + [drift * max(frame - 7.0, 0.0), 0.0]))
+    noise = np.repeat([vio.config.imu.gyro_noise_density, vio.config.imu.accel_noise_density], 3) / np.sqrt(0.002)
+    for k in range(4200):
+        read = noise * rng.normal(size=6) + [0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY]
+        vio.add_imu(ImuSample(2_000_000 * k, tuple(read[:3]), tuple(read[3:])))
+        if 0.002 * k > frame + 0.02:
+            if not 0.8 < frame < 7.0:
+                out.append((frame, vio.add_image(round((frame + MOUNT.stamp_offset) * 1e9), BLANK).outcome is FrameOutcome.RESTING))
+            frame += 1 / 30
+    assert any(resting for t, resting in out if t < 1.0) and any(resting for t, resting in out if t > 7.0) is rests
+
+
 def after_loss(change=lambda state: None, drift=0.0, shake=1.0, image=BLANK, count=60):
     """Results of 1.2 s after a loss in a hover of a filter whose state was changed; the IMU is quiet but for `shake` times its noise.
 

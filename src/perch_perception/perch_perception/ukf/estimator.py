@@ -20,13 +20,12 @@ from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.ukf.measurement import Estimate, Health, Status, VioOutcome, VioPose
 from perch_perception.ukf.rest import after_rest, after_stop
-from perch_perception.ukf.stillness import WINDOW, is_at_rest, leans, window
+from perch_perception.ukf.stillness import WINDOW, is_at_rest, leans, moves, window
 from perch_perception.ukf.unscented import GATES, Belief, CovarianceError, Innovation, UnscentedTransform
 
 _HISTORY = 0.5  # IMU kept for replay: VIO is late by 0.04 s, by 0.08 s in the campaign on robustness [s]
 _MAX_CONSECUTIVE_REJECTIONS = 15  # rejections in a row after which VIO is taken to have jumped
 _UNTRUSTED_VELOCITIES = 30  # after a start or a jump, only the pose of so many measurements is used, which shows whether their velocity fits
-_MOVING = 0.1  # speed of a vehicle that certainly moves, if it is known that well [m/s]
 _LOST_POSITION = 2.0  # 1 sigma beyond which the state is not to be used [m]
 _LOST_ATTITUDE = 0.6  # the same [rad]
 COVARIANCE_STRIDE = 5  # IMU steps per update of the published covariance
@@ -219,7 +218,7 @@ class Estimator:
         now, config = self._imu.newest.stamp, self.config
         if self._base is None or self._live is None:
             return
-        self._has_moved |= self._moves(self._live)
+        self._has_moved |= moves(self._live.x[at.VELOCITY], float(np.sqrt(np.diag(self._live.P)[at.D_VELOCITY].max())))
         belief, middle = self._base, now - round(0.5e9 * WINDOW)
         if belief.stamp >= middle or now - max(self._newest_vio_stamp, belief.stamp) < round(1e9 * config.coasting_after):
             return
@@ -242,12 +241,6 @@ class Estimator:
             self._set_base(after_rest(belief, self._imu.run(belief.stamp, middle), middle, config))
         except CovarianceError as error:
             self._diverge(str(error))
-
-    @staticmethod
-    def _moves(belief: Belief) -> bool:
-        """Whether the speed certainly exceeds rest: it is above `_MOVING`, and by six sigma above zero."""
-        speed = float(np.linalg.norm(belief.x[at.VELOCITY]))
-        return speed > _MOVING and speed > 6.0 * float(np.sqrt(np.diag(belief.P)[at.D_VELOCITY].max()))
 
     def _refresh(self) -> None:
         """Propagate the published covariance to the newest IMU stamp, and keep anchors for a replay of the IMU history."""

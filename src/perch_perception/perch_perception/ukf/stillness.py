@@ -30,6 +30,7 @@ _MIN_SAMPLES = 10
 _MIN_COVERAGE = 0.9   # share of the window that the samples must span
 _LAST_PART = 4        # part of the window, its last, that must look like rest as well: a departure has just begun
 _MEAN_GATE = 6.0      # sigma up to which a mean counts as zero
+_MOVING = 0.1         # speed of a vehicle that certainly moves, if it is known that well [m/s]
 _HOVER_COSINE = 0.866  # of 30 deg, the largest tilt of a vehicle that its rotors hold still in the wind
 
 
@@ -72,6 +73,11 @@ def leans(steps: np.ndarray) -> bool:
     """
     f = steps[:, ACCEL].mean(axis=0)
     return bool(f[2] < _HOVER_COSINE * np.linalg.norm(f))
+
+
+def moves(v_WB: np.ndarray, sigma: float) -> bool:
+    """Whether a velocity (3,), known to 1 sigma along each axis, certainly exceeds rest: by `_MOVING`, and by six sigma."""
+    return float(np.linalg.norm(v_WB)) > max(_MOVING, 6.0 * sigma)
 
 
 def _excess_means(steps: np.ndarray, biases: np.ndarray | None, known: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.values import ImuSample, OdometryState
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, without_gaps
 from perch_perception.ukf.odometry import pose_of
-from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS, energy, is_at_rest, leans, window
+from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS, energy, is_at_rest, leans, moves, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
@@ -71,7 +71,7 @@ class VisualInertialOdometry:
         self._gyro_bias: np.ndarray | None = None  # of the last filter whose biases may be true
         self._odometry: deque[OdometryState] | None = deque(maxlen=_KEPT_ODOMETRY)  # of the estimator; None from the first start on
         self._odometry_rests = False  # by the newest odometry, while it is used
-        self._at_rest = False
+        self._at_rest, self._has_moved = False, True  # has moved: since the last rest
         self._noise_factor = 1.0  # variance of the IMU at rest over that of the sensor's noise, as last measured
         self._at_configured_start = True  # the vehicle has not left the configured start
         self._last_visual_update: int | None = None  # when vision last changed the state; None: not since the last rest
@@ -192,7 +192,7 @@ class VisualInertialOdometry:
         if rests:
             self._store_pose()
             self._begin_motion_start()
-            self.filter, self._at_rest = None, False
+            self.filter, self._at_rest, self._at_configured_start = None, False, False
         elif self.filter is not None:
             self._drop_filter(_UNSEEN_SPEED if self._at_rest else 0.0)
         if moved:
@@ -244,13 +244,15 @@ class VisualInertialOdometry:
 
         With odometry, or after a loss in motion, it may hover, where for moments either looks like rest: the IMU must be quiet and
         the image static for long, or, without an image, the vehicle lean or be known to rest by the odometry. The biases of an
-        earlier filter do not count: they may be why it was lost. Odometry that cannot be used leaves the configured start.
+        earlier filter do not count: they may be why it was lost. Odometry that cannot be used leaves the configured start. A vehicle
+        that rested before its camera was silent or replaced may have left: what the image shows, it must show for long.
         """
         for_long, moving = self._recent_views.is_static(STATIC_DURATION), self._last_pose.known_at is not None
         if moving or self._odometry:
             unseen = for_long is None and (not moving or self._odometry_rests or leans(steps))
             return bool(for_long or unseen) and is_at_rest(steps)
-        return self._recent_views.is_static() is not False and is_at_rest(steps, image_is_static=bool(for_long))
+        static = self._recent_views.is_static() if self._at_configured_start else for_long
+        return static is not False and is_at_rest(steps, image_is_static=bool(for_long))
 
     def _take_odometry(self, exposure: int) -> None:
         """Make the newest odometry before an exposure the known pose."""
@@ -270,7 +272,7 @@ class VisualInertialOdometry:
         self._last_pose.propagate_position(state, self._imu)
         self.filter = Msckf(self.config, state, self.mount.camera.fx)
         self._last_update = state.stamp
-        self._odometry, self._odometry_rests = None, False
+        self._odometry, self._odometry_rests, self._has_moved = None, False, True
         self._observation_counts.clear()
 
     # -- afterwards --------------------------------------------------------------------------------------------------
@@ -284,6 +286,7 @@ class VisualInertialOdometry:
         self._at_rest = False
         filter.propagate(self._imu.run(filter.state.stamp, exposure), exposure)
         report = filter.add_frame(self._frame, features.ids, self._observe(features))
+        self._has_moved |= bool(report.used) or moves(filter.state.v_WB, velocity_sigma(filter.state))
         if report.used:
             self._last_visual_update, self._at_configured_start = exposure, False
         return self._check_divergence(exposure, features, report)
@@ -291,9 +294,9 @@ class VisualInertialOdometry:
     def _is_at_rest(self, exposure: int) -> bool:
         """Whether the vehicle rests: the IMU is quiet, nothing moves in the image, and the filter's velocity may be zero.
 
-        False until `_MAX_BLIND_NO_TRACKS` after a visual update: a very quiet hover looks like rest. After a flight, a rest begins only
-        with evidence beyond the IMU: an image that is static for long, a lean, or the height of standing on the floor. Where IMU
-        samples are missing, a vehicle that rested before rests still if the images since have not moved.
+        False until `_MAX_BLIND_NO_TRACKS` after a visual update: a very quiet hover looks like rest. A rest therefore begins only with
+        evidence beyond the IMU: an image that is static for long, a lean, the height of standing on the floor, or no motion since the
+        last rest. Where IMU samples are missing, a vehicle that rested before rests still if the images since have not moved.
         """
         if self._last_visual_update is not None and exposure - self._last_visual_update < round(1e9 * _MAX_BLIND_NO_TRACKS):
             return False
@@ -301,7 +304,7 @@ class VisualInertialOdometry:
         quiet, for_long = self._recent_views.is_static(), bool(self._recent_views.is_static(STATIC_DURATION))
         if self._at_rest and quiet and len(without_gaps(steps)) < len(steps):
             return for_long
-        evidence = for_long or leans(steps) or self._is_on_floor(state) or self._is_leaving(exposure)
+        evidence = for_long or leans(steps) or self._is_on_floor(state) or self._is_leaving(exposure) or not self._has_moved
         if not self._at_rest and not (evidence and rest.velocity_may_be_zero(state)):
             return False
         return quiet is not False and is_at_rest(steps, *_biases(state), image_is_static=bool(quiet) and (self._at_rest or for_long))
@@ -328,7 +331,7 @@ class VisualInertialOdometry:
         if not self._at_rest:
             filter.propagate(self._imu.run(state.stamp, until), until)
             rest.stop(filter)
-            self._at_rest, self._last_visual_update = True, None
+            self._at_rest, self._has_moved, self._last_visual_update = True, False, None
             self._views.clear()
         steps, latest = self._imu.run(state.stamp, until), window(self._imu, exposure)
         if len(without_gaps(latest)) == len(latest):

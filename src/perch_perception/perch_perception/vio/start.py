@@ -67,7 +67,7 @@ def odometry_pose(pose: VioPose) -> KnownPose:
 def is_known_to_rest(pose: VioPose, imu: ImuNoise) -> bool:
     """Whether the velocity of odometry is near zero, and better known than the IMU alone could keep it over `WINDOW`.
 
-    An estimator that has no VIO knows it so well only where it rests itself.
+    An estimator that has neither VIO nor motion capture knows it so well only where it rests itself.
     """
     sigma, P = imu.accel_noise_density * np.sqrt(WINDOW), pose.velocity_covariance
     return (pose.v_B is not None and P is not None and bool(np.diag(P).max() < sigma**2)
