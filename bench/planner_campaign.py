@@ -17,9 +17,10 @@ from pathlib import Path
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
-    from perch_setup import enter
+    from perch_setup import enter, leave_quietly_on_interrupt
 
     enter()
+    leave_quietly_on_interrupt()  # until the campaign begins
 
 import harness
 import numpy as np

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import signal
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,9 +17,10 @@ from pathlib import Path
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))
-    from perch_setup import enter
+    from perch_setup import enter, leave_quietly_on_interrupt
 
     enter("recordings")
+    leave_quietly_on_interrupt()  # until scoring begins
 
 import real_motion
 import recordings_scores as scores
@@ -36,7 +38,7 @@ EXAMPLES = """examples:
   nice -n 15 python3 bench/recordings.py FOLDER
   nice -n 15 python3 bench/recordings.py FOLDER --only floor
 
-exit code: 0 written, 2 wrong arguments or a recording that cannot be scored"""
+exit code: 0 written, 2 wrong arguments or a recording that cannot be scored, 130 interrupted"""
 
 
 @dataclass(frozen=True)
@@ -291,6 +293,7 @@ def score(arguments: argparse.Namespace) -> int:
     """Score the available recordings and write the page."""
     if not arguments.folder.is_dir():
         raise ConfigError("FOLDER", str(arguments.folder), "is no folder")  # the page would lose every recording
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     data = output_folder(arguments.out) / "results.json"
     single_threaded_blas()
     before = json.loads(data.read_text()) if arguments.only and data.is_file() else {}

@@ -17,7 +17,8 @@ EXAMPLES = """examples:
   python3 scripts/plan.py --list                           the problems there are
 
 files: plan.csv, plan.json (coefficients or figures, certificates), plan.png; powerline: visibility.png, plan.gif
-exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or file, 3 the independent verifier refuses the plan"""
+exit code: 0 planned, 1 refused (the reason on stderr), 2 wrong arguments or file, 3 the independent verifier refuses the plan,
+130 Ctrl-C"""
 
 
 def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:

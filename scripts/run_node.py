@@ -22,7 +22,7 @@ EXAMPLES = """examples:
 def main() -> int:
     """Replace this process by the node; return 2 if node or network are refused."""
     parser = command_parser(__doc__, EXAMPLES, allow_abbrev=False)
-    parser.add_argument("node", metavar="NODE", help="as in config/scenarios: vehicle, controller, ...")
+    parser.add_argument("node", metavar="NODE", help="vehicle, controller, ... (README, The graph), betaflight or mavlink")
     parser.add_argument("--no-config", action="store_true", help="do not pass config/<node>.yaml")
     parser.add_argument("--network", metavar="ADDRESS", help="open the ROS graph to the network in which this machine has this address (SECURITY.md)")
     arguments, for_node = parser.parse_known_args()
