@@ -28,6 +28,7 @@ EXAMPLES = """examples:
   python3 scripts/start_stack.py --namespace /quad1 --domain 7
 
 Other shells reach the nodes with the same ROS_DOMAIN_ID (42 by default, as in setup.bash).
+exit code: 0 stopped by Ctrl-C, 1 a node ended or did not come up, 2 wrong arguments or input
 """
 COLOURS = (36, 33, 32, 35, 34, 96, 93, 92, 95, 94, 31)
 

@@ -120,7 +120,7 @@ def _nodes(graph: GraphConnection, timeout: float) -> list[str]:
 def _client(graph: GraphConnection, node: str, timeout: float) -> AsyncParameterClient:
     client = AsyncParameterClient(graph.node, node)
     if not graph.spin_until(client.services_are_ready, timeout):
-        raise GraphError(f"node {node} does not exist or has no parameters; nodes that have: {', '.join(_nodes(graph, 1.0))}")
+        raise GraphError(f"node {node} does not exist or has no parameters; nodes that have: {', '.join(_nodes(graph, 1.0)) or 'none'}")
     return client
 
 

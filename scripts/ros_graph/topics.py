@@ -100,7 +100,7 @@ def publish(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     topic = graph.absolute(arguments.topic)
     publisher = graph.node.create_publisher(type(message), topic, QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
     if arguments.once and not graph.spin_until(lambda: publisher.get_subscription_count() > 0, arguments.spin_time):
-        raise GraphError(f"topic {topic} has no subscribers")
+        raise GraphError(f"topic {topic} has no subscribers of this type within {arguments.spin_time:g} s; 'topic.py info {topic}' shows its type")
     publisher.publish(message)
     due = time.monotonic()
     while not arguments.once:
