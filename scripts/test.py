@@ -21,8 +21,9 @@ PARTS = (
     ("tests/system/test_flight_surface.py",), ("tests/system/test_two_vehicles.py", "tests/unit/test_goals_in_a_row.py"),
     ("tests/system/test_restart.py",), ("tests/nodes/",), ("tests/unit/test_autopilot_firmware.py",),
     ("tests/recordings/",), ("tests/system/test_bad_input.py",), ("tests/system/test_campaign.py",),
-    ("tests/fuzz/test_messages.py",), ("tests/unit/test_types.py",), ("tests/unit/test_vio_filter.py",), ("tests/unit/test_vio_images.py",),
-    ("tests/unit/test_control_nmpc.py",), ("tests/unit/test_eval_replay.py", "tests/unit/test_eval_compare.py"),
+    ("tests/fuzz/test_messages.py", "tests/fuzz/test_services.py"), ("tests/unit/test_types.py",), ("tests/unit/test_vio_component.py",),
+    ("tests/unit/test_vio_filter.py",), ("tests/unit/test_vio_images.py",), ("tests/unit/test_vio_rest.py",), ("tests/unit/test_control_nmpc.py",),
+    ("tests/unit/test_eval_replay.py", "tests/unit/test_eval_compare.py"),
 )
 """The longest parts, which start first; files and folders of one part share expensive fixtures. Each other file is a part."""
 PROCESSES = 1 + min(os.cpu_count() or 1, 5)
