@@ -115,12 +115,16 @@ class WorkerPlugin:
         number = os.read(self._left, 2)
         return self._parts[int.from_bytes(number, "big")] if number else None
 
+    def pytest_collection(self) -> None:
+        """Nearly all that is made in the collection stays: the garbage collector would traverse it in vain."""
+        gc.disable()
+
     def pytest_runtestloop(self, session) -> bool:
         """Fork the other processes and run parts of the tests, in place of pytest's own loop."""
         if session.testsfailed:
             raise session.Interrupted(f"{session.testsfailed} files could not be collected")
         sys.stdout.flush()
-        gc.freeze()  # memory that the collector does not traverse is not copied
+        gc.freeze(), gc.enable()  # memory that the collector does not traverse is not copied
         while len(self._others) < self._processes - 1:
             output = tempfile.TemporaryFile("w+", errors="replace")
             if (pid := os.fork()) == 0:
