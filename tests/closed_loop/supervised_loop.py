@@ -155,7 +155,7 @@ class Body:
         self._step += 1
 
     def hover(self, settled: int = 250) -> None:
-        """Armed on a bench, then in the air for some periods: half a second."""
+        """Armed on a bench, then in the air for `settled` periods, half a second by default."""
         for k in range(250 + settled):
             self.step(k >= 50, moving=k >= 250)
 
