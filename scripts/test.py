@@ -21,8 +21,9 @@ PARTS = (
     ("tests/system/test_flight_surface.py",), ("tests/system/test_two_vehicles.py", "tests/unit/test_goals_in_a_row.py"),
     ("tests/system/test_restart.py",), ("tests/nodes/",), ("tests/unit/test_autopilot_firmware.py",),
     ("tests/recordings/",), ("tests/system/test_bad_input.py",), ("tests/system/test_campaign.py",),
-    ("tests/fuzz/test_messages.py",), ("tests/unit/test_types.py",), ("tests/unit/test_vio_filter.py",), ("tests/unit/test_vio_images.py",),
-    ("tests/unit/test_control_nmpc.py",), ("tests/unit/test_eval_replay.py", "tests/unit/test_eval_compare.py"),
+    ("tests/fuzz/test_messages.py", "tests/fuzz/test_services.py"), ("tests/unit/test_types.py",), ("tests/unit/test_vio_component.py",),
+    ("tests/unit/test_vio_filter.py",), ("tests/unit/test_vio_images.py",), ("tests/unit/test_vio_rest.py",), ("tests/unit/test_control_nmpc.py",),
+    ("tests/unit/test_eval_replay.py", "tests/unit/test_eval_compare.py"),
 )
 """The longest parts, which start first; files and folders of one part share expensive fixtures. Each other file is a part."""
 PROCESSES = 1 + min(os.cpu_count() or 1, 5)
@@ -114,12 +115,16 @@ class WorkerPlugin:
         number = os.read(self._left, 2)
         return self._parts[int.from_bytes(number, "big")] if number else None
 
+    def pytest_collection(self) -> None:
+        """Nearly all that is made in the collection stays: the garbage collector would traverse it in vain."""
+        gc.disable()
+
     def pytest_runtestloop(self, session) -> bool:
         """Fork the other processes and run parts of the tests, in place of pytest's own loop."""
         if session.testsfailed:
             raise session.Interrupted(f"{session.testsfailed} files could not be collected")
         sys.stdout.flush()
-        gc.freeze()  # memory that the collector does not traverse is not copied
+        gc.freeze(), gc.enable()  # memory that the collector does not traverse is not copied
         while len(self._others) < self._processes - 1:
             output = tempfile.TemporaryFile("w+", errors="replace")
             if (pid := os.fork()) == 0:

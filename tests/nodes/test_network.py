@@ -5,14 +5,14 @@ from __future__ import annotations
 import ipaddress
 import os
 import socket
-import subprocess
-import sys
+from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 from perch_core.errors import ConfigError
 from perch_eval.arguments import open_network
-from system.scripts import ROOT
+from system import forks
+from system.scripts import PATIENCE, ROOT
 
 PEER = """
 import os, sys, time
@@ -30,27 +30,33 @@ for protocol in ("udp", "udp6", "tcp", "tcp6"):
         if inode in inodes:
             print(bytes.fromhex(address)[::-1].hex() if len(address) == 8 else address, flush=True)
 print("done", flush=True)
-sys.stdin.read()
+while not os.path.exists(sys.argv[2]):
+    time.sleep(0.01)
 node.destroy_node()
 context.shutdown()
 """
 
 
-def sockets(count: int, **variables: str) -> list[set[str]]:
+def sockets(folder: Path, count: int, **variables: str) -> list[set[str]]:
     """The addresses to which the sockets of processes are bound that find each other as `count` ROS nodes."""
-    command = [sys.executable, "-c", PEER, str(count)]
-    peers = [subprocess.Popen(command, env=os.environ | variables, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(count)]
-    found = []
-    for peer in peers:
-        lines = iter(peer.stdout.readline, "done\n")
-        found.append({str(ipaddress.ip_address(bytes.fromhex(line.strip()))) for line in lines})
-    for peer in peers:
-        peer.communicate(timeout=60)
+    script, over, peers, outputs, found = folder / "peer.py", folder / "over", [], [], []
+    script.write_text(PEER)
+    with (folder / "peers.log").open("w") as log:
+        for _ in range(count):
+            reads, writes = os.pipe()
+            outputs.append(os.fdopen(reads))
+            with os.fdopen(writes, "w") as output:
+                peers.append(forks.Forked(forks.SCRIPTS, [str(script), str(count), str(over)], output, log, os.environ | variables))
+    for output in outputs:
+        with output:
+            found.append({str(ipaddress.ip_address(bytes.fromhex(line.strip()))) for line in iter(output.readline, "done\n")})
+    over.touch()
+    assert [peer.wait(PATIENCE) for peer in peers] == [0] * count
     return found
 
 
-def test_processes_find_each_other_over_sockets_that_are_bound_to_loopback(ros_domain):
-    for addresses in sockets(3):
+def test_processes_find_each_other_over_sockets_that_are_bound_to_loopback(ros_domain, tmp_path):
+    for addresses in sockets(tmp_path, 3):
         assert addresses == {"127.0.0.1"}
 
 
@@ -61,11 +67,11 @@ def test_what_they_miss_of_each_other_at_the_start_comes_with_an_announcement_ha
     assert 0 < 10**9 * seconds + nanoseconds <= 500_000_000
 
 
-def test_they_find_each_other_where_discovery_is_local_as_well(ros_domain):
-    assert all(sockets(2, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST"))
+def test_they_find_each_other_where_discovery_is_local_as_well(ros_domain, tmp_path):
+    assert all(sockets(tmp_path, 2, ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST"))
 
 
-def test_a_named_network_is_the_only_one_that_is_opened(ros_domain, monkeypatch):
+def test_a_named_network_is_the_only_one_that_is_opened(ros_domain, monkeypatch, tmp_path):
     monkeypatch.setenv("PERCH_NETWORK", "127.0.0.1")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
         try:
@@ -74,7 +80,7 @@ def test_a_named_network_is_the_only_one_that_is_opened(ros_domain, monkeypatch)
             pytest.skip("this machine is in no network")
         own = route.getsockname()[0]
     open_network(own)
-    assert sockets(2) == [{own}] * 2
+    assert sockets(tmp_path, 2) == [{own}] * 2
 
 
 @pytest.mark.parametrize("address", ["192.0.2.77", "0.0.0.0", "not-a-host.invalid", "1" * 300])

@@ -1,6 +1,7 @@
 """Faults at the start end a node with one line and exit code 2, and no motor turns; faults in flight do not end it.
 
-The nodes run as processes, against Betaflight's firmware or against bytes made as an autopilot sends them.
+The nodes run as processes, against Betaflight's firmware or against bytes made as an autopilot sends them. Against the firmware they are
+started as a user does; the others are forked from a process that has their code.
 """
 
 from __future__ import annotations
@@ -25,9 +26,12 @@ from perch_autopilot.namespace import NamespaceError
 from perch_autopilot.sitl import GRAVITY, LEVEL, Sitl
 from perch_autopilot.watchdog import OFF, ON
 from perch_eval.domain import reserved_domain
+from perch_eval.nodes import executable
+from system import forks
 
 PATIENCE = 120.0  # for a process on a busy machine [s]
 NODE = "from perch_autopilot.{0}_node import main; main()"
+NODES = ("perch_autopilot.betaflight_node", "perch_autopilot.mavlink_node")
 CURVE = ("name: mine\nextends: betaflight\nactuation:\n  type: rates_and_thrust\n"
          "  battery: {reference: 16.0, exponent: 1.8, range: [13.6, 16.8]}\n")
 
@@ -39,13 +43,43 @@ def domain(monkeypatch) -> Iterator[None]:
         yield
 
 
-def started(node: str, passed: tuple[int, ...] = (), **parameters: str) -> subprocess.Popen:
+class Forked(forks.Forked):
+    """A node's executable, forked, and what it says, as do the processes that it starts."""
+
+    def __init__(self, node: str, words: list[str]) -> None:
+        reads, writes = os.pipe()
+        with os.fdopen(writes, "w") as output:
+            super().__init__(NODES, [executable("perch_autopilot", node), "--ros-args", *words], output, output)
+        self._said: list[str] = []
+        self._reader = threading.Thread(target=self._read, args=(reads,), daemon=True)
+        self._reader.start()
+
+    def _read(self, file: int) -> None:
+        with os.fdopen(file, errors="replace") as said:
+            self._said.append(said.read())
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, None]:
+        """As `Popen`'s: when all of them have ended."""
+        self.wait(timeout)
+        self._reader.join(timeout)
+        if self._reader.is_alive():
+            raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
+        return "".join(self._said), None
+
+
+Process = subprocess.Popen | Forked
+
+
+def started(node: str, passed: tuple[int, ...] = (), **parameters: str) -> Process:
+    """Forked, unless files are passed on."""
     words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
+    if not passed:
+        return Forked(node, words)
     return subprocess.Popen([sys.executable, "-c", NODE.format(node), "--ros-args", *words], pass_fds=passed,
                             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
-def ended(process: subprocess.Popen) -> str:
+def ended(process: Process) -> str:
     """What it has said when it has ended."""
     try:
         return process.communicate(timeout=PATIENCE)[0]
@@ -53,14 +87,14 @@ def ended(process: subprocess.Popen) -> str:
         process.kill()
 
 
-def refused(process: subprocess.Popen, words: str) -> None:
+def refused(process: Process, words: str) -> None:
     """It ends by itself, with one line and exit code 2."""
     said = ended(process)
     assert process.returncode == 2 and words in said, said
     assert said.startswith("error: ") and said.count("\n") == 1, said
 
 
-def goes_on(process: subprocess.Popen, *words: str) -> None:
+def goes_on(process: Process, *words: str) -> None:
     """It is alive, ends upon SIGTERM only, and has said so."""
     assert process.poll() is None, process.communicate()[0]
     process.send_signal(signal.SIGTERM)
@@ -142,7 +176,7 @@ def torn(frame: bytes) -> bytes:
 
 
 @contextmanager
-def all_started(node: str, peers: dict[str, Peer], **parameters: str) -> Iterator[dict[str, tuple[subprocess.Popen, Peer]]]:
+def all_started(node: str, peers: dict[str, Peer], **parameters: str) -> Iterator[dict[str, tuple[Process, Peer]]]:
     """A process for each peer, all at once, as a start with a fault waits for seconds."""
     with reserved_domain() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(number))
@@ -167,7 +201,7 @@ AT_START = {
 
 
 @pytest.fixture(scope="module")
-def betaflights(tmp_path_factory) -> Iterator[dict[str, tuple[subprocess.Popen, Peer]]]:
+def betaflights(tmp_path_factory) -> Iterator[dict[str, tuple[Process, Peer]]]:
     """A node for each fault of `AT_START`."""
     file, peers = tmp_path_factory.mktemp("faults") / "mine.yaml", {}
     file.write_text(CURVE)
@@ -212,7 +246,7 @@ def catches(pid: int, number: int) -> bool:
     return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
 
 
-def until(what, process: subprocess.Popen) -> None:
+def until(what, process: Process) -> None:
     last = time.monotonic() + PATIENCE
     while not what():
         assert process.poll() is None, process.communicate()[0]
@@ -237,7 +271,7 @@ MAVLINK_AT_START = {
 
 
 @pytest.fixture(scope="module")
-def mavlinks() -> Iterator[dict[str, tuple[subprocess.Popen, Peer]]]:
+def mavlinks() -> Iterator[dict[str, tuple[Process, Peer]]]:
     """A node for each fault of `MAVLINK_AT_START`."""
     noises = {name: noise() for name, (noise, _) in MAVLINK_AT_START.items()}
     peers = {name: Peer() for name in noises}

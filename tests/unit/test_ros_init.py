@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
 import pytest
+from system import forks
 
 pytest.importorskip("rclpy")
 
@@ -16,6 +15,7 @@ from perch_core.ros.ros_init import init_ros
 init_ros(["program", "--ros-args", "-r", "__node:=given"])
 node = rclpy.create_node("default")
 node.get_logger().info(f"I am {node.get_name()}")
+node.destroy_node()
 rclpy.shutdown()
 """
 
@@ -28,7 +28,8 @@ def test_a_node_starts_whether_or_not_the_log_folder_of_ros_can_be_written(chang
     """A service of systemd has no HOME, a user of a container no home of its own. `rclpy.init` alone raises RCLError there."""
     environment = {name: value for name, value in os.environ.items() if name not in ("ROS_HOME", "ROS_LOG_DIR", *changed)}
     environment |= {name: value.format(tmp=tmp_path) for name, value in changed.items() if value is not None}
-    ran = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, timeout=120, check=False)
+    (tmp_path / "program.py").write_text(PROGRAM)
+    ran = forks.run(forks.SCRIPTS, [str(tmp_path / "program.py")], 120.0, environment)
     assert ran.returncode == 0, ran.stderr
     assert "I am given" in ran.stderr + ran.stdout
     assert ("warning: ROS writes no log files: " + problem in ran.stderr) is bool(problem), ran.stderr
