@@ -124,7 +124,8 @@ class WorkerPlugin:
         if session.testsfailed:
             raise session.Interrupted(f"{session.testsfailed} files could not be collected")
         sys.stdout.flush()
-        gc.freeze(), gc.enable()  # memory that the collector does not traverse is not copied
+        gc.freeze()  # memory that the collector does not traverse is not copied
+        gc.enable()
         while len(self._others) < self._processes - 1:
             output = tempfile.TemporaryFile("w+", errors="replace")
             if (pid := os.fork()) == 0:
