@@ -130,7 +130,7 @@ def figures(quick: bool) -> list[Figure]:
         name = f"plan as shipped, {waypoints} waypoints"
         out += [figure(name, "ms", times, median), figure(f"{name}, p99", "ms", times, p99, "p99 <="),
                 figure(f"{name}, CPU time", "ms", cpu), figure(f"{name}: refused of {count}", "problems", [refused])]
-        if find_spec("rotorpy"):  # `.venv/bin/python -m pip install --no-deps rotorpy cvxopt`
+        if find_spec("rotorpy"):  # `.venv/bin/python -m pip install rotorpy`
             times, failed = _rotorpy_times(waypoints, count)
             out += [figure(f"RotorPy's MinSnap, {waypoints} waypoints, no limit of thrust", "ms", times),
                     figure(f"RotorPy's MinSnap, {waypoints} waypoints: not solved of {count}", "problems", [failed])]
