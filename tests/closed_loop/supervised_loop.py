@@ -154,9 +154,9 @@ class Body:
             self._force = self.plant.specific_force_B
         self._step += 1
 
-    def hover(self, settled: int = 250) -> None:
-        """Armed on a bench, then in the air for `settled` periods, half a second by default."""
-        for k in range(250 + settled):
+    def hover(self) -> None:
+        """Armed, and settled: half a second."""
+        for k in range(500):
             self.step(k >= 50, moving=k >= 250)
 
     def found(self, axis, tilt: float, rate: float) -> None:

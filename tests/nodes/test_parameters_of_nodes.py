@@ -1,4 +1,4 @@
-"""`param.py` (and so `ros2 param`) at a node that runs; what every node refuses is shown in `test_ros_parameters.py`."""
+"""`param.py` (and so `ros2 param`) at a node that runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ def test_a_parameter_is_described_before_and_after_a_refusal_alike(graph):
     assert "double, to 0.25, [s], > 0" in described
     refused = param("set", "/controller", name, "50.0")
     assert refused.returncode == 1 and name in refused.stdout and "50" in refused.stdout
-    again = param("describe", "/controller", name, "vehicle").stdout
-    assert again.startswith(described)
-    fixed = again.removeprefix(described)
-    assert fixed.startswith("vehicle: ") and "string" in fixed and "read-only" in fixed
+    assert param("describe", "/controller", name).stdout == described
+    unknown = param("set", "/controller", "no_such_gain", "1.0")
+    assert unknown.returncode != 0 and "no_such_gain" in unknown.stdout + unknown.stderr
+    fixed = param("describe", "/controller", "vehicle").stdout
+    assert "string" in fixed and "read-only" in fixed
+    assert param("set", "/controller", "vehicle", "rpg").returncode == 1

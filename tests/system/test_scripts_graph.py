@@ -99,6 +99,7 @@ def test_parameters(run):
     assert yaml.safe_load(run("param.py", "dump", "/peer").stdout)["/peer"]["ros__parameters"]["gain"] == 3.0
     unknown = run("param.py", "get", "/peer", "gian")
     assert unknown.returncode == 2 and "gian" in unknown.stderr
+    run("param.py", "set", "/peer", "gain", "2.0")
 
 
 def test_a_node_that_does_not_exist(peer):

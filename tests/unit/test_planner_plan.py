@@ -389,7 +389,7 @@ def test_values_that_remove_limits_are_valid_settings():
 
 def test_a_rotor_margin_above_zero_is_reduced_to_zero_at_most_where_this_suffices():
     with pytest.raises(PerchRefusal) as caught:
-        plan(PerchProblem(HOVER, surface(90.0)), PerchSettings(rotor_margin=0.2), VEHICLE)
+        plan(PerchProblem(HOVER, surface(90.0)), PerchSettings(rotor_margin=0.4), VEHICLE)
     assert caught.value.relaxed["rotor_margin"] >= 0.0
 
 

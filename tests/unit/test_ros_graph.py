@@ -6,19 +6,18 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from ros_graph import connection  # noqa: E402
+from ros_graph.connection import connect  # noqa: E402
 
 
 def test_an_observation_is_settled_once_the_whole_graph_is(ros_domain, monkeypatch):
     """On a busy machine a topic may stay as it is for a while although its last endpoints are still to be discovered."""
-    monkeypatch.setattr(connection, "_SETTLED_S", 0.2)
     checks = 0
 
     def nodes():
         nonlocal checks
         checks += 1
-        return {f"/node_{min(checks, 20)}"}
+        return {f"/node_{min(checks, 60)}"}
 
-    with connection.connect() as graph:
+    with connect() as graph:
         monkeypatch.setattr(graph, "nodes", nodes)
-        assert graph.settle(lambda: ["one"] if checks < 20 else ["one", "two"], 600.0) == ["one", "two"]
+        assert graph.settle(lambda: ["one"] if checks < 60 else ["one", "two"], 600.0) == ["one", "two"]

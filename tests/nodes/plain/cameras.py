@@ -1,5 +1,5 @@
 """A camera over a textured floor and one at a board of four AprilTags, both at rest, from plain publishers: nothing of perch is
-imported. `cameras.py both|compressed` prints what came back as JSON. Nobody but the nodes themselves says where the vehicle is."""
+imported. `cameras.py raw|compressed|both` prints what came back as JSON. Nobody but the nodes themselves says where the vehicle is."""
 
 import array
 import json
@@ -38,9 +38,9 @@ class Cameras(Node):
         floor = cv2.GaussianBlur(rng.integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8), (0, 0), 2.0)
         self.images = {"down": cv2.normalize(floor, None, 0, 255, cv2.NORM_MINMAX), "front": board(0.16)}
         self.ticks = 0
-        self.stamp = time.time_ns() + {"both": 20, "compressed": 30}[kinds] * 10**9  # evidently another stream than that of the script before
+        self.stamp = time.time_ns() + {"raw": 10, "both": 20, "compressed": 30}[kinds] * 10**9  # evidently another stream than that of the script before
         topics = {Image: "image_raw", CompressedImage: "image_raw/compressed"}
-        wanted = {"both": [CompressedImage, Image], "compressed": [CompressedImage]}[kinds]
+        wanted = {"raw": [Image], "both": [CompressedImage, Image], "compressed": [CompressedImage]}[kinds]
         self.cameras = {name: ([(kind, self.create_publisher(kind, f"camera_{name}/{topics[kind]}", qos_profile_sensor_data)) for kind in wanted],
                                self.create_publisher(CameraInfo, f"camera_{name}/camera_info", qos_profile_sensor_data)) for name in self.images}
         self.imu = self.create_publisher(Imu, "imu/data_raw", qos_profile_sensor_data)
