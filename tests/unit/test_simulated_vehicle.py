@@ -196,6 +196,15 @@ def test_in_real_time_the_hosts_time_paces_the_flight_and_what_was_missed_is_tol
     assert len(seen["diagnostics"]) == 2 and seen["diagnostics"][-1].stamp == 2_058 * MS
 
 
+def test_calls_in_time_advance_one_step_each_whatever_the_rounding_of_their_times():
+    flown, _ = vehicle()
+    rng, begin = np.random.default_rng(1), 10_000 * MS
+    flown.on_pace(begin)
+    for k in range(1, 200):
+        flown.on_pace(begin + 2 * MS * k + int(rng.integers(-50_000, 50_000)))
+        assert flown.time == 1_000 * MS + 2 * MS * k
+
+
 @pytest.mark.parametrize("lost, told", [(0, False), (8, False), (2, True)])
 def test_commands_that_get_lost_on_their_way_are_told(lost, told):
     """One of `lost`; 0: none."""

@@ -3,6 +3,7 @@
 import time
 from dataclasses import dataclass
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
@@ -127,3 +128,19 @@ def test_without_simulation_time_on_the_clock_the_time_of_timers_goes_on(executo
     executor.add_node(node)
     until(executor, lambda: len(node.component.times) > 10)
     assert node.component.times[-1] - node.component.times[0] > 20_000_000 and set(node.component.stamps) == {0}
+
+
+def test_a_late_call_of_a_timer_has_the_time_at_which_it_was_due(executor, monkeypatch):
+    node, made = ArrivalNode("waking", Waking, Wiring(), context=executor.context), []
+
+    def create_timer(period, callback, clock):
+        made.append(SimpleNamespace(callback=callback, timer_period_ns=round(1e9 * period), time_until_next_call=lambda: 5_000_000 - late))
+        return made[-1]
+
+    monkeypatch.setattr(node, "create_timer", create_timer)
+    node.connect()
+    begin = time.monotonic_ns()
+    for k, late in enumerate((0, 1_700_000, 4_900_000, 20_000)):
+        monkeypatch.setattr(time, "monotonic_ns", lambda: begin + 5_000_000 * k + late)
+        made[0].callback()
+    assert [after - before for before, after in pairwise(node.component.times)] == [5_000_000] * 3

@@ -172,7 +172,8 @@ class SimulatedVehicle(Component[VehicleParameters]):
     def on_pace(self, now: int) -> None:
         """Advance all periods that the host's time [ns] has reached; emit images when they are rendered."""
         if self._pacing is None:
-            self._pacing = Pacing(CONTROL_PERIOD_NS, now)
+            # calls come at multiples of the period: steps become due a little before, so that rounding shifts none to the next call
+            self._pacing = Pacing(CONTROL_PERIOD_NS, now - CONTROL_PERIOD_NS // 4)
             self.simulation.motors.timeout = REAL_TIME_MOTOR_TIMEOUT
             for camera in self.simulation.cameras.values():
                 camera.max_pending_images = MAX_PENDING_IMAGES

@@ -18,6 +18,7 @@ from perch_core.ros.priority import priority
 from perch_core.ros.service_clients import Send, connect_clients
 from perch_core.ros.wiring import Wiring, foreign_publishers
 from rclpy.clock import Clock, ClockType, ROSClock
+from rclpy.timer import Timer as RosTimer
 
 CHECK_PERIOD = 1.0  # of the check for foreign publishers, whose messages are ignored [s]
 
@@ -54,13 +55,19 @@ class ArrivalNode(ComponentNode):
 
     def _create_component_timer(self, port: Timer) -> None:
         handler = partial(self.guarded, port.name, port.handler(self.component))
-        now = self.host_time if port.stamping else self._steady_time
-        self.create_timer(port.period, lambda: self._intake.enter(handler, now()), clock=self._steady)
 
-    def _steady_time(self) -> int:
-        """Return simulation time once it is received; otherwise a monotonic time, which goes on where the system's clock is set [ns]."""
+        def call() -> None:
+            self._intake.enter(handler, self.host_time() if port.stamping else self._due_time(timer))
+
+        timer: RosTimer = self.create_timer(port.period, call, clock=self._steady)
+
+    def _due_time(self, timer: RosTimer) -> int:
+        """Return simulation time once it is received; otherwise when a timer's present call was due [ns].
+
+        The latter is a monotonic time, which goes on where the system's clock is set.
+        """
         simulated = self.host_time() if cast(ROSClock, self.get_clock()).ros_time_is_active else 0
-        return simulated or time.monotonic_ns() + self._steady_offset
+        return simulated or time.monotonic_ns() + self._steady_offset + timer.time_until_next_call() - timer.timer_period_ns
 
     def _warn_foreign_publishers(self) -> None:
         """Warn once of each foreign publisher on a topic that a neighbour publishes: its messages are ignored."""
