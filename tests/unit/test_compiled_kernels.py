@@ -59,6 +59,8 @@ def test_numba_comes_with_the_first_call_and_what_is_compiled_is_loaded_without_
     for left in (tmp_path / "__pycache__").glob("kernels.unit*"):
         left.unlink()
     assert called() == ["5.0", "False", "False", "0.6", "0.0", "-0.8", "1"]
+    ahead = "import kernels; from perch_core.jit import load_cached; load_cached('kernels'); print(len(kernels.unit.dispatcher.overloads))"
+    assert subprocess.run([sys.executable, "-c", ahead], env=environment, capture_output=True, text=True, check=True).stdout == "1\n"
 
 
 SCALED = """

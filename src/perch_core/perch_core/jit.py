@@ -94,9 +94,11 @@ class _Compiled:
     """
 
     plain = False  # what `uncompiled` switches, for all kernels
+    kernels: list[_Compiled] = []  # of all imported modules
 
     def __init__(self, kernel: Callable[..., Any], options: dict[str, Any]) -> None:
         self.py_func, self._options = kernel, options
+        self.kernels.append(self)
         update_wrapper(self, kernel)
 
     @cached_property
@@ -124,6 +126,12 @@ class _Compiled:
             cache.load_overload = partial(_load, cache)
         return out
 
+    def load_cached(self) -> None:
+        """Load the compiled code for all signatures in the cache."""
+        cache: Any = getattr(getattr(self.dispatcher, "_cache", None), "_cache_file", None)
+        for signature, *_ in cache._load_index() if hasattr(cache, "_load_index") else ():
+            self.dispatcher.compile(signature)
+
     def __call__(self, *arguments: Any) -> Any:
         return self.py_func(*arguments) if self.plain else self.dispatcher(*arguments)
 
@@ -150,6 +158,13 @@ def compiled(kernel: Any = None, *, nogil: bool = False, inline: bool = False) -
         kernel.py_func = kernel
         return kernel
     return _Compiled(kernel, {"nogil": nogil, "forceinline": inline})
+
+
+def load_cached(*packages: str) -> None:
+    """Load the cached code of all kernels in the imported modules of some packages: a first call would load it, in 5 to 20 ms."""
+    for kernel in tuple(_Compiled.kernels):
+        if kernel.py_func.__module__.partition(".")[0] in packages:
+            kernel.load_cached()
 
 
 def interpreted(kernel: Kernel) -> Kernel:

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, cast
 
 from perch_core.component import Action, Client, Component, Input, Service, Timer, ports
+from perch_core.jit import load_cached
 from perch_core.ros.component_node import ComponentNode
 from perch_core.ros.deadlines import Deadlines
 from perch_core.ros.intake import Intake
@@ -38,6 +39,7 @@ class ArrivalNode(ComponentNode):
         self._steady_offset = self.host_time() - time.monotonic_ns()  # as measured at the start [ns]
         self._deadlines: Deadlines | None = None
         if deadline:
+            load_cached(component.__module__.partition(".")[0], "perch_core")
             self._deadlines = deadlines = Deadlines()
             getattr(self.component, deadline).receivers.append(lambda value: deadlines.record_answer(value.stamp, time.monotonic_ns()))
 
