@@ -170,9 +170,7 @@ class MissionClient(GraphNode):
                 on_phase(self.time, "cancelling", f"time limit of {scenario.time_limit:g} s reached")
                 handle.cancel_goal_async()
         answer = result.result().result
-        outcome = outcome_of(answer.error_code, scenario)
-        if cancelled < math.inf and outcome == "cancelled":
-            outcome = "timeout"
+        outcome = outcome_of(answer.error_code, scenario, timed_out=cancelled < math.inf)
         return FlightResult(outcome, answer.message, answer.end_time or self.time, time.monotonic() - began, start)
 
     def depart(self, check: Callable[[], None]) -> tuple[bool, str]:
