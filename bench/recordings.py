@@ -155,6 +155,19 @@ In rooms arcs are edges of doors and folds of curtains, on NASA's photographs pa
 wire by its motion (`backdrop`), which single photographs do not show. Wires that end at a pole before they cross half of the image are not
 found."""
 
+L515 = ("L515, with `sigma: {{track: 1.0}}` in the sensor file: {tracked} of {all} frames tracked, {restarts} restarts, "
+        "{vio[path_m]:.0f} m, the end {vio[final_distance_m]:.2f} m from the start.")
+TURNS = ("{poses} poses; the turn against the photograph at 0 deg is wrong by {error_deg_mean:.2f} deg in the mean, "
+         "{error_deg_max:.1f} deg at most")
+ROOMS = "{found} of {reference} found, {false} false"
+POSES = ("position {position_percent_rms:.2f} % rms of the distance, attitude {attitude_deg_rms:.2f} deg rms, NEES per dimension "
+         "{nees_mean:.1f} (median {nees_median:.1f}), {poses} of {boards}; residual of the reference {reference_px:.2f} px")
+WIRES_TRACED = ("precision {precision:.0f} %, recall {recall:.0f} % (without any sixth of the photographs they change by at most "
+                "{precision_without_a_sixth:.1f} and {recall_without_a_sixth:.1f} percentage points)")
+ARCS = "{ours[arcs]} arcs in {ours[photographs]} photographs"
+IN_MAP = "{powerlines} wires in the map"
+"""Results in words, of the figures of a recording."""
+
 
 # -- the page --------------------------------------------------------------------------------------------------------
 
@@ -176,13 +189,6 @@ def motion(key: str, f: Figures) -> list[str]:
             f"{vio['attitude_rms_deg']:.2f} deg", f"{vio['nees_position_mean'] / 3:.1f}", str(f["restarts"]), required(key, vio)]
 
 
-def l515(f: Figures) -> str:
-    """Return the result on the recording without truth as text."""
-    frames = sum(f["frames"].values())
-    return (f"L515, with `sigma: {{track: 1.0}}` in the sensor file: {f['frames'].get('TRACKING', 0)} of {frames} frames tracked, {f['restarts']} restarts, "
-            f"{f['vio']['path_m']:.0f} m, the end {f['vio']['final_distance_m']:.2f} m from the start.")
-
-
 def race(f: Figures) -> list[str]:
     """Cells of a row on racing motion."""
     errors = f["error_percent"]
@@ -198,23 +204,10 @@ def corners(f: Figures) -> str:
             f"({f['corner_px_p90']:.2f} px at 90 %){others}")
 
 
-def turns(f: Figures) -> str:
-    """Return the result on the rotation series as text."""
-    return (f"{f['poses']} poses; the turn against the photograph at 0 deg is wrong by {f['error_deg_mean']:.2f} deg in the mean, "
-            f"{f['error_deg_max']:.1f} deg at most")
-
-
 def grid(f: Figures) -> str:
     """Return the result on the AprilGrid as text."""
     return (f"{', '.join(map(str, f['tags']))} of 36 tags (one photograph cuts the grid), {f['false']} false; on one lens to "
             f"{f['residual_px']:.2f} px")
-
-
-def poses(f: Figures) -> str:
-    """Return the result on the clipboard as text."""
-    return (f"position {f['position_percent_rms']:.2f} % rms of the distance, attitude {f['attitude_deg_rms']:.2f} deg rms, "
-            f"NEES per dimension {f['nees_mean']:.1f} (median {f['nees_median']:.1f}), {f['poses']} of {f['boards']}; "
-            f"residual of the reference {f['reference_px']:.2f} px")
 
 
 def board(f: Figures) -> str:
@@ -222,12 +215,6 @@ def board(f: Figures) -> str:
     f = f["target"]
     return (f"{f['found']} of {f['images']} images, residual {f['reprojection_rms_px']:.2f} px; the board's place in the map scatters by "
             f"{100 * f['spread_m']:.1f} cm rms")
-
-
-def wires(f: Figures) -> str:
-    """Return the result on photographs with traced wires as text."""
-    return (f"precision {f['precision']:.0f} %, recall {f['recall']:.0f} % (without any sixth of the photographs they change by at most "
-            f"{f['precision_without_a_sixth']:.1f} and {f['recall_without_a_sixth']:.1f} percentage points)")
 
 
 def judged(f: Figures) -> str:
@@ -245,7 +232,7 @@ def page(results: Mapping[str, Figures], command: str, code: Mapping[str, str]) 
         return [RECORDINGS[key].title, text(ours) if ours else MISSING, text(theirs) if theirs else "-"]
 
     def arcs(key: str) -> list[str]:
-        return row(key, lambda f: f"{f['ours']['arcs']} arcs in {f['ours']['photographs']} photographs", ", without wires")
+        return row(key, ARCS.format_map, ", without wires")
 
     lines = ["# Perception on recordings", "", banner([code["commit"]], [code["digest"]]), "", f"Made by `{command}` on {machine()}. This page is generated.",
              INTRODUCTION, *table("recording | what it is | source | licence", (
@@ -261,19 +248,20 @@ def page(results: Mapping[str, Figures], command: str, code: Mapping[str, str]) 
     if "v101_flight" in results:
         lines += [FLIGHT]
     if "l515" in results:
-        lines += ["", l515(results["l515"])]
+        frames = results["l515"]["frames"]
+        lines += ["", L515.format_map({**results["l515"], "tracked": frames.get("TRACKING", 0), "all": sum(frames.values())})]
     if "racing" in results:
         required_here = f"required: at most {RACING_ERROR_MAX} %, NEES {NEES_MAX:g}"
         lines += [RACING, *table(f"flight | path | final error of each seed | {required_here} | NEES per dimension | frames lost",
                                  map(race, results["racing"]["flights"]))]
     return [*lines, TAGS, *table("recording | ours | pupil-apriltags", (
-        pair("nasa", corners), pair("rotation", turns),
-        pair("rooms", lambda f: f"{f['found']} of {f['reference']} found, {f['false']} false"),
-        [*row("aprilgrid", grid), "-"], [*row("floor", board), "-"], [*row("clipboard", poses, ", poses of six tags"), "-"])),
+        pair("nasa", corners), pair("rotation", TURNS.format_map),
+        pair("rooms", ROOMS.format_map),
+        [*row("aprilgrid", grid), "-"], [*row("floor", board), "-"], [*row("clipboard", POSES.format_map, ", poses of six tags"), "-"])),
             WIRES, *table("recording | found", (
-                row("pldu", wires), row("pldm", wires), row("street", judged),
+                row("pldu", WIRES_TRACED.format_map), row("pldm", WIRES_TRACED.format_map), row("street", judged),
                 arcs("rotation"), arcs("rooms"), arcs("nasa"),
-                *(row(key, lambda f: f"{f['powerlines']} wires in the map", ", without wires") for key in ("v101", "floor")))), END]
+                *(row(key, IN_MAP.format_map, ", without wires") for key in ("v101", "floor")))), END]
 
 
 # -- the command -----------------------------------------------------------------------------------------------------

@@ -15,27 +15,21 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from harness import Figure, figure
 from machine import LateWakeUps, StolenTime, cores_awake, late_with_load
-from nav_msgs.msg import Odometry
 from perch_core.errors import PerchError
 from perch_core.ros.topics import stamp_of, topic
 from perch_core.trajectory import rest_to_rest
-from perch_core.values import ControllerCommand as Command
-from perch_core.values import TrajectoryOrder, nanoseconds, seconds
+from perch_core.values import Command, ControllerCommand, TrajectoryOrder, nanoseconds, seconds
 from perch_eval.campaign.causes import SUCCESS
 from perch_eval.demo import fly
 from perch_eval.domain import domain_in_environment
 from perch_eval.nodes import ALL_NODES, CHAIN_NODES, programs
 from perch_eval.ros.graph_node import GraphNode
 from perch_eval.stack import Stack
-from perch_msgs.msg import ControllerCommand as CommandMessage
-from perch_msgs.msg import MotorCommand
 from perch_sim.scenario import Scenario, load_scenario
-from sensor_msgs.msg import Imu
 
 SEEDS = "flights: from 1, one each; the rest: 1"
 CHAIN = ("vehicle", "vio_model", "estimator", "controller")  # the stand-in VIO: nothing here is about estimation
-ARM = CommandMessage.ARM
-RATES = {"imu/data_raw": Imu, "odometry": Odometry, "motor_command": MotorCommand}
+RATES = ("imu/data_raw", "odometry", "motor_command")
 WINDOW = 1.0  # s
 
 
@@ -50,10 +44,10 @@ class Probe(GraphNode):
                         for channel in ("controller/command", "trajectory")}
         self.diagnostics: dict[str, dict[str, str]] = {}
         for channel in RATES:
-            self.node.create_subscription(RATES[channel], channel, partial(self._count, channel), topic(channel).qos.subscribe, raw=True)
+            self.node.create_subscription(topic(channel).message, channel, partial(self._count, channel), topic(channel).qos.subscribe, raw=True)
         # read by hand: an executor does not pass on when a message was sent
         self._aside = rclpy.create_node("probe_aside", context=self._context)
-        self._newest = {channel: self._aside.create_subscription(RATES[channel], channel, print, topic(channel).qos.subscribe, raw=True)
+        self._newest = {channel: self._aside.create_subscription(topic(channel).message, channel, print, topic(channel).qos.subscribe, raw=True)
                         for channel in ("imu/data_raw", "motor_command")}
         diagnostics = topic("/diagnostics")
         self.node.create_subscription(diagnostics.message, diagnostics.channel, self._diagnose, diagnostics.qos.subscribe)
@@ -70,7 +64,7 @@ class Probe(GraphNode):
     def _count(self, channel: str, data: bytes) -> None:
         self.counts[channel] += 1
         if channel == "odometry":
-            self.stamp = stamp_of(Odometry, data)
+            self.stamp = stamp_of(topic(channel).message, data)
 
     def delays(self) -> list[float]:
         """Return the delays from the publication of an IMU sample to that of its motor command, of the newest samples [us]."""
@@ -79,7 +73,7 @@ class Probe(GraphNode):
             sent[channel] = {}
             with subscription.handle:
                 while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
-                    sent[channel][stamp_of(RATES[channel], taken[0])] = taken[1]["source_timestamp"]
+                    sent[channel][stamp_of(subscription.msg_type, taken[0])] = taken[1]["source_timestamp"]
         imu, command = sent["imu/data_raw"], sent["motor_command"]
         return [1e-3 * (command[stamp] - imu[stamp]) for stamp in imu.keys() & command.keys()]
 
@@ -95,7 +89,7 @@ class Probe(GraphNode):
         """Wait for the estimate, arm, and fly to a hover at 1 m."""
         self.spin_until(lambda: self.diagnostics.get("estimator", {}).get("state") == "RUNNING", 10.0)
         self.spin_for(2.0)
-        self.order("controller/command", Command(self.stamp, ARM, "bench"))
+        self.order("controller/command", ControllerCommand(self.stamp, Command.ARM, "bench"))
         self.spin_for(0.2)
         begin = self.stamp + nanoseconds(0.2)
         climb = rest_to_rest(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 2.0, start_time=seconds(begin))

@@ -208,19 +208,16 @@ def test_a_node_of_a_process_in_which_others_speak_is_not_called_silent(mission,
     assert events == [f"/vio {SILENT}"]
 
 
-def test_time_that_stands_still_for_long_ends_the_flight_and_names_who_owes(mission, pilot, monkeypatch):
+def test_time_that_stands_still_for_long_ends_the_flight_and_names_who_owes(mission, pilot):
     mission.passes.set()
     hear_who_owes(pilot)
     threading.Thread(target=lambda: (mission.begins.wait(120.0), mission.passes.clear()), daemon=True).start()
-    update = client_module._Progress.update
 
-    def hurried(progress, time_now):
-        progress._last_progress -= 0.0 if mission.passes.is_set() else 100.0  # every update is later than the one before
-        return update(progress, time_now)
+    def hurry():
+        pilot._last_clock -= 0.0 if mission.passes.is_set() else 100.0  # every check is later than the one before
 
-    monkeypatch.setattr(client_module._Progress, "update", hurried)
     with pytest.raises(PerchError, match=r"stopped at .* waiting for estimator: odometry of 1.200 s"):
-        pilot.fly(SCENARIO, stall_timeout=1000.0)
+        pilot.fly(SCENARIO, check=hurry, stall_timeout=1000.0)
 
 
 def test_a_flight_past_its_time_limit_is_cancelled(mission, pilot):

@@ -12,7 +12,6 @@ from typing import Any
 from perch_core.vehicle import load_vehicle
 from perch_eval import plots
 from perch_eval.arguments import command, command_parser, output_file
-from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
 from perch_eval.margins import limits, margins, number
 from perch_eval.metrics import FIGURES, figures, flight_metrics
@@ -32,9 +31,8 @@ exit code: 0 written, 2 invalid input (no such recording, nothing in it)"""
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two flights: the recording, its end [s], figures from it and from its `report.json`, and whether the vehicle is known."""
+    """One of the two flights: its end [s], the recording, figures from it and from its `report.json`, and whether the vehicle is known."""
 
-    flight: Flight
     until: float
     view: FlightView
     report: dict[str, Any]
@@ -42,7 +40,7 @@ class Side:
 
     def digest(self, until: float) -> str:
         """Return the flight's hash up to a time [s]; that up to its end is known."""
-        return self.report["flight_hash"] if until == self.until else self.flight.digest(until)
+        return self.report["flight_hash"] if until == self.until else self.view.flight.digest(until)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -92,7 +90,7 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
     report = {**report, **flight_metrics(flight, until), "flight_hash": flight_hash}
     found = {one["name"]: one for one in report.get("margins", ()) if one.get("left") is not None}
     found |= {one.name: one.mapping() for one in margins(flight, model) if identified is not None}
-    return Side(flight, until, view, report | {"margins": list(found.values())}, identified is not None)
+    return Side(until, view, report | {"margins": list(found.values())}, identified is not None)
 
 
 def compare(a: Side, b: Side) -> str:

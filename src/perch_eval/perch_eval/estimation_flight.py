@@ -26,7 +26,7 @@ from perch_eval.in_process.modelled_sight import NoParameters
 from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotionConfig, read_imu
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.ukf import Estimate, UkfConfig
-from perch_perception.vio import VioPoseEstimate, VioResult
+from perch_perception.vio import VioResult
 from perch_perception.vio.start import CONFIGURED_POSE_SIGMA
 from perch_perception.vio_component import VioComponent, VioComponentConfig
 from perch_sim.calibration import true_imu, true_mount
@@ -292,7 +292,8 @@ class EstimatorTrack:
 def run_estimator(flight: Flight, steps: list[VioStep], latency: float = 0.040, begin: float = 0.7) -> EstimatorTrack:
     """Run the estimator on IMU samples and VIO states, each used `latency` [s] after its exposure, or with the next sample."""
     stamps = {middle: stamp for middle, stamp, _ in flight.frames}
-    states = {stamps[s.time]: _state(s.result.estimate) for s in steps if s.result.estimate is not None and s.time in stamps}
+    states = {stamps[s.time]: InertialState(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.v_WB, e.gyro_bias, e.accel_bias, e.P)
+              for s in steps if (e := s.result.estimate) is not None and s.time in stamps}
     estimator, vehicle = _Estimator(begin), _Vehicle(flight, transport=min(TRANSPORT, latency))
     loop = Loop(vehicle, {"estimator": estimator, "vio": _ReplayedVio(states)}, {"estimator": Task(), "vio": Task(latency)}, {})
     _run(loop, vehicle)
@@ -302,7 +303,3 @@ def run_estimator(flight: Flight, steps: list[VioStep], latency: float = 0.040, 
     return EstimatorTrack(np.array([truth.times[k] for k, _ in estimator.states]), np.array(errors),
                           np.array([e.P for _, e in estimator.states]), np.array(estimator.nis, float).reshape(-1, 2),
                           tuple(loop.trace.values("estimator/status")))
-
-
-def _state(e: VioPoseEstimate) -> InertialState:
-    return InertialState(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.v_WB, e.gyro_bias, e.accel_bias, e.P)

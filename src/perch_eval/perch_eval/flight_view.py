@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from perch_core import so3
-from perch_core.values import CameraImage
 from perch_core.vehicle import Vehicle
 from perch_eval.flight import Flight, States
 from perch_eval.metrics import perch_window
@@ -28,7 +27,6 @@ class FlightView:
         estimate, reference: estimated and reference states, where recorded.
         pad: true pose of the pad p (3,), R (3, 3), where there is one.
         cables: end points of mapped wires, (n, 2, 3).
-        camera: (time [s], image) of the front camera's images.
         start, end: of the perch, or of the recording where there is none [s].
         until: end of what is shown [s].
     """
@@ -42,7 +40,6 @@ class FlightView:
     reference: States | None
     pad: tuple[np.ndarray, np.ndarray] | None
     cables: np.ndarray
-    camera: list[tuple[float, CameraImage]]
     start: float
     end: float
     until: float
@@ -62,7 +59,7 @@ class FlightView:
         last = max(float(truth.t[0]), min(float(truth.t[-1]), until))
         window = perch_window(flight) or (float(truth.t[0]), last)
         return cls(name, colour, flight, vehicle, truth, flight.states("odometry"), flight.reference(), pad, cables.reshape(-1, 2, 3),
-                   flight.values("camera_front/image_raw/compressed"), *window, last)
+                   *window, last)
 
     def around(self, before: float, after: float) -> tuple[float, float]:
         """Return the time span of the perch with margins before and after it, as far as it is recorded and shown [s]."""

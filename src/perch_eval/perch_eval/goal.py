@@ -29,7 +29,9 @@ def goal_of(scenario: Scenario) -> PerchGoal:
         perception_aware=mission.perception_aware, replan=mission.replan, attempts=mission.attempts)
 
 
-def outcome_of(error_code: int, scenario: Scenario) -> str:
-    """Return the outcome of a goal from the error code of its result."""
+def outcome_of(error_code: int, scenario: Scenario, timed_out: bool = False) -> str:
+    """Return the outcome of a goal from the error code of its result; `timed_out`: it was cancelled at the scenario's time limit."""
     outcome = OUTCOMES.get(error_code, "failed")
-    return "inspected" if outcome == "perched" and scenario.mode == "inspection" else outcome
+    if outcome == "perched" and scenario.mode == "inspection":
+        return "inspected"
+    return "timeout" if outcome == "cancelled" and timed_out else outcome

@@ -6,7 +6,7 @@ differential flatness, and simulated readings of a vehicle's IMU.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
@@ -14,7 +14,7 @@ from perch_core import config, so3
 from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import GRAVITY, ImuConfig
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy.interpolate import make_interp_spline
 
 
 @dataclass(frozen=True)
@@ -86,22 +86,16 @@ def _rise(x: np.ndarray) -> np.ndarray:
     return x**5 * (126 + x * (-420 + x * (540 + x * (-315 + 70 * x))))
 
 
-@dataclass(frozen=True)
 class PerchMotion:
     """A motion whose state is exact at any time in [0, duration]."""
 
-    settings: PerchMotionConfig = PerchMotionConfig()
-    seed: int = 0
-    duration: float = field(init=False)
-    _path: tuple[BSpline, ...] = field(init=False, repr=False)  # position and its derivatives up to the fourth
-
-    def __post_init__(self) -> None:
-        s = self.settings
-        object.__setattr__(self, "duration", s.ground + s.climb + s.hover + s.perch)
+    def __init__(self, settings: PerchMotionConfig = PerchMotionConfig(), seed: int = 0) -> None:
+        self.settings, self.seed = settings, seed
+        self.duration = settings.ground + settings.climb + settings.hover + settings.perch
         times = np.arange(0.0, self.duration + 0.0201, 0.02)
-        # a spline of degree 7 through the path: position and its derivatives then belong together exactly
+        # a spline of degree 7 through the path: position and its derivatives, here up to the fourth, then belong together exactly
         path = make_interp_spline(times, self._position(times), k=7)
-        object.__setattr__(self, "_path", tuple(path.derivative(k) if k else path for k in range(5)))
+        self._path = tuple(path.derivative(k) if k else path for k in range(5))
 
     @property
     def perch_time(self) -> float:

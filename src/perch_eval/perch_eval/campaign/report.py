@@ -24,12 +24,6 @@ METRICS = {name: (f"{FIGURES[name][0]} [{FIGURES[name][1]}]", FIGURES[name][2]) 
 
 def write_report(campaign: Campaign, found: Sequence[RunResult], folder: Path) -> Path:
     """Write `report.html` into the campaign's folder and return its path."""
-    path = folder / "report.html"
-    path.write_text(_page(campaign, found, folder))
-    return path
-
-
-def _page(campaign: Campaign, found: Sequence[RunResult], folder: Path) -> str:
     rate = Rate.from_outcomes(r.cause == SUCCESS for r in found)
     varied = [name for name in campaign.vary if name != "seed"]
     complete = [r for r in found if all(name in r.values for name in varied)]
@@ -43,7 +37,9 @@ def _page(campaign: Campaign, found: Sequence[RunResult], folder: Path) -> str:
     if present:
         parts.append(section("Errors", _spreads(found, present) + image(figures.distributions(found, present))))
     parts.append(section("Failed flights, and kept ones", _flights(found, folder)))
-    return page(campaign.name, *parts, heading=text(campaign.name) + (f": {100 * rate.value:.1f} % success" if found else ""))
+    path = folder / "report.html"
+    path.write_text(page(campaign.name, *parts, heading=text(campaign.name) + (f": {100 * rate.value:.1f} % success" if found else "")))
+    return path
 
 
 def _facts(campaign: Campaign, found: Sequence[RunResult], rate: Rate) -> str:

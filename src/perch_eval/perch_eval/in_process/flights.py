@@ -125,8 +125,6 @@ def perch(loop: Loop, scenario: Scenario, linger: float = 0.0) -> FlightTrace:
     if result is None:
         trace.outcome, trace.message = "timeout", f"no end within {trace.end_time:.1f} s"
     else:
-        trace.outcome, trace.message = outcome_of(result.error_code, scenario), result.message
-        if trace.outcome == "cancelled" and timed_out:
-            trace.outcome = "timeout"
+        trace.outcome, trace.message = outcome_of(result.error_code, scenario, timed_out), result.message
     trace.wall_time = clock.perf_counter() - began
     return trace

@@ -13,7 +13,7 @@ from perch_core import config
 from perch_core.component import Component, LogLine
 from perch_core.sensors import Sensors
 from perch_core.tag_board import load_board
-from perch_core.values import (CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState, OdometryState, PowerlineMap,
+from perch_core.values import (CameraImage, CameraModel, ImuSample, InertialState, OdometryState, PowerlineMap,
                                TargetPose, TargetSighting)
 from perch_eval.node_launch import read_parameters
 from perch_eval.recordings.drawing import Gallery, GalleryImage, canvas, caption, draw_board, draw_wires
@@ -143,7 +143,6 @@ class Perception:
         vio: the component of VIO.
         states: of VIO.
         odometry: of the estimator, one per IMU sample while its position sigma is below `MAX_POSITION_SIGMA`.
-        health: of the estimator.
         sightings, targets: of the target localiser.
         lines: the newest powerline map; None: none yet.
         log: (node, level, text) of warnings and errors -> number of occurrences.
@@ -175,14 +174,12 @@ class Perception:
         self._camera_components: list[tuple[str, CameraComponent[Any] | None]] = [(down, self.vio), (front, self.target), (front, self.wires)]
         self.states: list[InertialState] = []
         self.odometry: list[OdometryState] = []
-        self.health: list[EstimatorHealth] = []
         self.sightings: list[TargetSighting] = []
         self.targets: list[TargetPose] = []
         self.lines: PowerlineMap | None = None
         self.log: dict[tuple[str, str, str], int] = {}
         self.vio.state.receivers += [self.states.append, self.estimator.on_vio_state]
         self.vio.odometry.receivers.append(self.estimator.on_vio_odometry)
-        self.estimator.status.receivers.append(self.health.append)
         self.estimator.odometry.receivers.append(self._store_odometry)
         if self.target is not None:
             self.target.sightings, self.target.found, self.target.missed = self.sightings, Gallery(), Gallery(4)

@@ -35,6 +35,7 @@ class Scene:
             start, end: time span of the animation [s].
         """
         self._view, self._start = view, start
+        self._camera = view.flight.values("camera_front/image_raw/compressed")
         self._inside = (view.truth.t >= start) & (view.truth.t <= end)
         self.figure = Figure(figsize=(10.0, 5.4), layout="constrained")
         grid = self.figure.add_gridspec(3, 3)
@@ -77,7 +78,7 @@ class Scene:
         self._image.set_xticks([])
         self._image.set_yticks([])
         self._shown = self._image.imshow(np.zeros((480, 640), np.uint8), cmap="gray", vmin=0, vmax=255)
-        self._image.set_title("front camera" if self._view.camera else "no camera images recorded", fontsize=8)
+        self._image.set_title("front camera" if self._camera else "no camera images recorded", fontsize=8)
 
     def draw(self, time: float) -> None:
         """Show the flight at a time [s]."""
@@ -96,7 +97,7 @@ class Scene:
         self._space.set_title(f"t = {time:.2f} s   {speed:.1f} m/s   tilt {tilt_degrees(now.q)[0]:.0f} deg", fontsize=10)
 
     def _show_image(self, time: float) -> None:
-        images = [image for t, image in self._view.camera if t <= time]
+        images = [image for t, image in self._camera if t <= time]
         if images:
             pixels = images[-1].pixels()
             if pixels is not None:

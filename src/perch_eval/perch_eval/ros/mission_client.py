@@ -55,31 +55,6 @@ class FlightResult:
     start_time: float | None = None
 
 
-class _Progress:
-    """Monitors simulation time: when it started, and whether it advances."""
-
-    def __init__(self, time_now: float) -> None:
-        self.began = self._last_progress = time.monotonic()
-        self.start = self._last = time_now
-        self._explained = False
-
-    def update(self, time_now: float) -> float:
-        """Return the wall-clock time for which simulation time has not advanced [s]."""
-        now = time.monotonic()
-        if time_now > self._last:
-            if self._last == 0.0:  # it begins
-                self.began, self.start = now, time_now
-            self._last, self._last_progress, self._explained = time_now, now, False
-        return now - self._last_progress
-
-    def should_explain(self) -> bool:
-        """Return whether a stop of simulation time is to be reported now; true once per stop."""
-        if self._explained or time.monotonic() - self._last_progress < EXPLAIN_AFTER:
-            return False
-        self._explained = True
-        return True
-
-
 class MissionClient(GraphNode):
     """Client of the mission. Time is that of `/clock`, or of `clock` in the namespace if there is one.
 
@@ -98,7 +73,7 @@ class MissionClient(GraphNode):
         self._vehicle = self.node.get_namespace().rstrip("/") + "/vehicle"
         self.time, self._last_check = 0.0, 0.0
         self._waits: dict[str, str] = {}  # node -> what it waits for, by its newest diagnostics
-        self._last_clock = time.monotonic()  # when time advanced last [s]
+        self._last_clock = time.monotonic()  # when time advanced last, or a goal was sent [s]
         self._last_message: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
         self.processes: dict[str, str] = {}
         self._silent: set[str] = set()
@@ -159,7 +134,9 @@ class MissionClient(GraphNode):
             if node in scenario.nodes:
                 offered = partial(self.node.count_services, self.node.resolve_service_name(service))
                 self._spin_until(offered, check, START_TIMEOUT, f"{node} does not offer {service}")
-        progress, servers = _Progress(self.time), self._servers()
+        servers, explained = self._servers(), math.nan  # simulation time whose standing still was explained [s]
+        began = self._last_clock = time.monotonic()
+        start = self.time
         sent = self._client.send_goal_async(goal_message(goal_of(scenario)), feedback_callback=feedback)
 
         def answered() -> bool:
@@ -178,22 +155,23 @@ class MissionClient(GraphNode):
             for text in self.node_events():
                 on_phase(self.time, reported[0], text)
             self._check_graph(servers, scenario.nodes)
-            stopped = progress.update(self.time)
-            if progress.should_explain():
+            if start == 0.0 < self.time:  # it begins
+                began, start = time.monotonic(), self.time
+            stopped = time.monotonic() - self._last_clock
+            if stopped > EXPLAIN_AFTER and explained != self.time:
+                explained = self.time
                 on_phase(self.time, "waiting", f"simulation time has stopped: {self._waiting_text()}")
             if stopped > (stall_timeout if self.time > 0.0 else START_TIMEOUT):
                 raise PerchError(f"simulation time has been stopped at {self.time:.3f} s for {stopped:.0f} s: {self._waiting_text()}")
             if self.time - cancelled > CANCEL_TIMEOUT:
                 raise PerchError(f"the mission has not ended the goal in {CANCEL_TIMEOUT:g} s since it was cancelled")
-            if self.time - progress.start > scenario.time_limit and cancelled == math.inf:
+            if self.time - start > scenario.time_limit and cancelled == math.inf:
                 cancelled = self.time
                 on_phase(self.time, "cancelling", f"time limit of {scenario.time_limit:g} s reached")
                 handle.cancel_goal_async()
         answer = result.result().result
-        outcome = outcome_of(answer.error_code, scenario)
-        if cancelled < math.inf and outcome == "cancelled":
-            outcome = "timeout"
-        return FlightResult(outcome, answer.message, answer.end_time or self.time, time.monotonic() - progress.began, progress.start)
+        outcome = outcome_of(answer.error_code, scenario, timed_out=cancelled < math.inf)
+        return FlightResult(outcome, answer.message, answer.end_time or self.time, time.monotonic() - began, start)
 
     def depart(self, check: Callable[[], None]) -> tuple[bool, str]:
         """Command a perched vehicle to depart to a hover.

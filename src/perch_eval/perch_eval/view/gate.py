@@ -58,22 +58,17 @@ def allowed(origin: str | None, origins: Iterable[str]) -> bool:
     for one in origins:
         if one in ("*", origin) and origin != "null":
             return True
-        if "://" in one and _host(one) == _host(origin) and _port(one) is None:
+        if "://" in one and _parts(one) == (*_parts(origin)[:2], None):
             return True
     return False
 
 
-def _host(origin: str) -> tuple[str, str | None]:
+def _parts(origin: str) -> tuple[str, str | None, int | None]:
+    """Return scheme, host and port of an origin; a malformed one has a port that is none."""
     with contextlib.suppress(ValueError):
         parts = urlsplit(origin)
-        return parts.scheme.lower(), parts.hostname
-    return "", origin
-
-
-def _port(origin: str) -> int | None:
-    with contextlib.suppress(ValueError):
-        return urlsplit(origin).port
-    return -1
+        return parts.scheme.lower(), parts.hostname, parts.port
+    return "", origin, -1
 
 
 class Gate:
