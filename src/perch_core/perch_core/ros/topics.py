@@ -5,7 +5,6 @@ A new topic needs a new row. Ports name channels (`perch_core.component`); hosts
 
 from __future__ import annotations
 
-import importlib.util
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,6 +34,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
 Convert = Callable[[Any], Any]
@@ -125,6 +125,10 @@ TOPICS = (
     Topic("/clock", Clock, qos.CLOCK, lambda stamp: Clock(clock=to_stamp(stamp)), lambda msg: stamp_value(msg.clock), observed=True),
     Topic("/diagnostics", DiagnosticArray, qos.STATE, diagnostics_message, diagnostics_value),
     Topic("markers", MarkerArray, qos.STATE, markers.markers_message, markers.markers_value),
+    Topic("/tf", TFMessage, qos.SENSOR, lambda value: TFMessage(transforms=[sensing.stamped_transform_message(value)]),
+          lambda msg: [sensing.stamped_transform_value(one) for one in msg.transforms]),
+    Topic("/tf_static", TFMessage, qos.STATIC, lambda value: TFMessage(transforms=[sensing.transform_message(value)]),
+          lambda msg: [sensing.transform_value(one) for one in msg.transforms]),
     Topic("robot_description", String, qos.LATCHED, lambda text: String(data=text), lambda msg: msg.data),
 )
 
@@ -173,15 +177,6 @@ class ActionRow:
 ACTIONS = (ActionRow("perch", Perch, mission.goal_value, mission.feedback_message, mission.result_message, mission.rejected),)
 
 
-def _rows() -> tuple[Topic, ...]:
-    """Return all rows; those of TF only if `tf2_msgs` is installed."""
-    if importlib.util.find_spec("tf2_msgs") is None:
-        return TOPICS
-    from perch_core.ros.messages import transforms
-
-    return (*TOPICS, *transforms.topics())
-
-
 @lru_cache(maxsize=None)
 def topic(channel: str) -> Topic:
     """Return the row of a channel.
@@ -190,7 +185,7 @@ def topic(channel: str) -> Topic:
         PerchError: there is no such channel.
     """
     parts = channel.split("/")
-    for row in _rows():
+    for row in TOPICS:
         pattern = row.channel.split("/")
         if len(pattern) == len(parts) and all(w == p or (w.endswith("*") and p.startswith(w[:-1])) for w, p in zip(pattern, parts)):
             return row
