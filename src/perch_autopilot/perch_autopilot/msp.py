@@ -15,7 +15,6 @@ from typing import NamedTuple
 from perch_core.errors import PerchError
 
 FC_VARIANT, FC_VERSION, ANALOG, RAW_IMU, ATTITUDE, STATUS, SET_RAW_RC = 2, 3, 110, 102, 108, 150, 200
-LONGEST = 255
 GYRO_LSB = 16.4  # readings per deg/s: the firmware's gyros have a range of 2000 deg/s
 VERSIONS = ((4, 3), (4, 6))
 """Oldest and newest supported firmware; later versions invert the sign of yaw."""
@@ -59,13 +58,7 @@ class Frame(NamedTuple):
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
-    """Return a request as bytes.
-
-    Raises:
-        MspError: the payload is longer than a frame can be.
-    """
-    if len(payload) > LONGEST:
-        raise MspError(f"MSP {command}: {len(payload)} bytes are more than {LONGEST}")
+    """Return a request as bytes; the payload has up to 255 bytes."""
     body = bytes((len(payload), command)) + payload
     return b"$M<" + body + bytes((_checksum(body),))
 
@@ -189,10 +182,9 @@ def status(frame: Frame) -> Status:
 
 
 class Battery(NamedTuple):
-    """Voltage [V], charge used [mAh], strength of the radio's signal 0..1, current [A]."""
+    """Voltage [V], strength of the radio's signal 0..1, current [A]."""
 
     voltage: float
-    used: int
     rssi: float
     current: float
 
@@ -203,9 +195,9 @@ def battery(frame: Frame) -> Battery:
     Raises:
         MspError: the answer is refused or too short.
     """
-    tenths, used, rssi, current = _unpacked("<BHHh", frame)
+    tenths, rssi, current = _unpacked("<B2xHh", frame)
     voltage = _unpacked("<7xH", frame)[0] / 100.0 if len(frame.payload) >= 9 else tenths / 10.0
-    return Battery(voltage, used, min(rssi / 1023.0, 1.0), current / 100.0)
+    return Battery(voltage, min(rssi / 1023.0, 1.0), current / 100.0)
 
 
 def attitude(frame: Frame) -> tuple[float, float, float]:
