@@ -9,7 +9,9 @@ Numbers are little-endian. `RAW_IMU` is in FLU; angles of `ATTITUDE` are positiv
 from __future__ import annotations
 
 import struct
+from functools import reduce
 from math import radians
+from operator import xor
 from typing import NamedTuple
 
 from perch_core.errors import PerchError
@@ -60,14 +62,7 @@ class Frame(NamedTuple):
 def request(command: int, payload: bytes = b"") -> bytes:
     """Return a request as bytes; the payload has up to 255 bytes."""
     body = bytes((len(payload), command)) + payload
-    return b"$M<" + body + bytes((_checksum(body),))
-
-
-def _checksum(body: bytes) -> int:
-    total = 0
-    for byte in body:
-        total ^= byte
-    return total
+    return b"$M<" + body + bytes((reduce(xor, body),))
 
 
 class Parser:
@@ -103,7 +98,7 @@ class Parser:
                 self._skip()
             elif len(buffer) < size + 6:
                 return found
-            elif _checksum(bytes(buffer[3:size + 5])) != buffer[size + 5]:
+            elif reduce(xor, buffer[3:size + 5]) != buffer[size + 5]:
                 self.checksum_errors += 1
                 self._skip()
             else:
