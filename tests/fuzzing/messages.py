@@ -25,6 +25,7 @@ from perch_core.errors import PerchError
 from perch_core.isolated import IsolatedRunner
 from perch_core.job import Job, JobFailed, JobStopped
 from perch_core.ros import topics
+from rclpy.serialization import deserialize_message
 from fuzzing import sense
 from fuzzing.report import Report
 from fuzzing.spoiled import Way, in_effect, senseless, some_way, spoilt
@@ -164,7 +165,8 @@ def inputs_of(flight: str, name: str) -> dict[str, tuple[str, list[int]]]:
 
 @lru_cache(maxsize=None)
 def _message(flight: str, name: str, channel: str, k: int) -> Any:
-    return topics.topic(channel).to_message(recorded(flight)[name][k].arguments[0])
+    value = recorded(flight)[name][k].arguments[0]
+    return deserialize_message(topics.encode(channel, value), topics.message_type(channel))
 
 
 def _on_the_wire(message: Any) -> bytes:

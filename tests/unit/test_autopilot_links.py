@@ -194,6 +194,25 @@ def test_a_link_that_is_opened_again_does_not_wait_for_an_autopilot_that_does_no
             assert time.monotonic() < last
 
 
+def test_a_link_that_is_opened_again_finds_an_autopilot_whose_name_has_another_address(monkeypatch):
+    """A vehicle that was restarted may have got another address; here another port stands for it."""
+    with socket.create_server(("127.0.0.1", 0)) as before, socket.create_server(("127.0.0.1", 0)) as after:
+        found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", before.getsockname())]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+        Link("tcp:moving-vehicle:5761").close()
+        before.close()
+        found = [(socket.AF_INET6, socket.SOCK_STREAM, 6, "", ("::1", 1, 0, 0)), (socket.AF_INET, socket.SOCK_STREAM, 6, "", after.getsockname())]
+        last, connected = time.monotonic() + 60.0, False
+        while not connected:
+            assert time.monotonic() < last
+            with suppress(LinkError):
+                link = Link("tcp:moving-vehicle:5761")
+                while not (connected := link.connected()):
+                    time.sleep(0.01)
+        after.accept()[0].close()
+        link.close()
+
+
 @pytest.fixture(params=["serial", "tcp"])
 def address(request) -> Iterator[str]:
     """A serial port, or one by TCP."""

@@ -40,6 +40,15 @@ def test_a_value_is_refused_with_field_value_and_range(value, said):
     assert limits.problem(value).startswith(said) and bool(limits.problem(value)) == bool(said)
 
 
+def test_a_value_that_several_components_take_is_judged_once(monkeypatch):
+    judged, state = [], ODOMETRY._replace(stamp=1)
+    monkeypatch.setitem(limits._FAST_CHECKS, OdometryState, lambda value: judged.append(value) or True)
+    assert not limits.problem(state) and not limits.problem(state) and len(judged) == 1
+    assert not limits.problem(state._replace()) and len(judged) == 2
+    bad = IMU._replace(f_B=(0.0, nan, 0.0))
+    assert limits.problem(bad) and limits.problem(bad), "what is refused is refused again"
+
+
 @pytest.mark.parametrize("command", [MotorCommand(0, True, (nan,) * 4), RatesThrust(0, True, (0.0, nan, 0.0), 9.81),
                                      AttitudeThrust(0, True, (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, nan)])
 def test_motors_stop_whatever_else_a_command_says(command):

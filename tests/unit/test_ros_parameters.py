@@ -12,7 +12,7 @@ from perch_core.component import Component
 from perch_core.config import choice, derived, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.registry import resolved
-from perch_core.ros.node import _warn_unused_parameter_files, node
+from perch_core.ros.node import NodeSpec, _warn_unused_parameter_files
 from perch_core.ros.parameters import _leaves
 from perch_eval.in_process.parameters import COMPONENTS
 from rclpy.context import Context
@@ -51,7 +51,7 @@ class Graph:
     def __init__(self):
         self.context = Context()
         rclpy.init(args=[], context=self.context)
-        self.tuned = node("tuned", Tuned).create(context=self.context, use_global_arguments=False)
+        self.tuned = NodeSpec("tuned", Tuned).create(context=self.context, use_global_arguments=False)
         self.asker = Node("asker", context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.tuned), self.executor.add_node(self.asker)
@@ -126,7 +126,7 @@ def test_an_accepted_value_counts_at_once_whole_numbers_for_real_ones_too(graph,
 @pytest.mark.parametrize("name", ["lockstep_timout", "use_sim_timee", "start_type_description_services", "qos_overrides./odometry.subscription.depth"])
 def test_names_that_begin_as_a_parameter_of_the_host_are_refused(graph, name):
     with pytest.raises(ConfigError, match=name):
-        node("mistyped", Tuned).create(context=graph.context, use_global_arguments=False, parameter_overrides=[Parameter(name, value=True)])
+        NodeSpec("mistyped", Tuned).create(context=graph.context, use_global_arguments=False, parameter_overrides=[Parameter(name, value=True)])
 
 
 @pytest.mark.parametrize("section, used", [

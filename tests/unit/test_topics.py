@@ -10,9 +10,11 @@ from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.goal_server import ServedGoal
 from perch_core.ros.intake import Intake
+from perch_core.ros.messages.sensing import imu_value
 from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust
 from perch_msgs.action import Perch
 from perch_sim.scenario import NODES
+from unit.rclpy_messages import message_of
 from rclpy.serialization import deserialize_message, serialize_message
 
 RNG = np.random.default_rng(3)
@@ -45,9 +47,9 @@ def same(a, b):
 @pytest.mark.parametrize("channel, value", FAST)
 def test_fast_messages_are_those_of_rclpy(channel, value):
     row = topics.topic(channel)
-    by_rclpy = serialize_message(row.to_message(value))
-    assert deserialize_message(row.pack(value), row.message) == deserialize_message(by_rclpy, row.message)
-    assert same(row.unpack(by_rclpy), row.to_value(deserialize_message(by_rclpy, row.message)))
+    by_rclpy = serialize_message(message_of(value))
+    assert deserialize_message(row.to_message(value), row.message) == deserialize_message(by_rclpy, row.message)
+    assert same(row.to_value(by_rclpy), value)
     assert same(topics.decode(channel, topics.encode(channel, value)), value)
 
 
@@ -75,11 +77,11 @@ def test_a_message_that_is_cut_short_is_refused(channel, value):
     ("odometry", _odometry(), lambda msg: setattr(msg, "child_frame_id", "odom"), "'odom'"),
     ("vio/odometry", _odometry(), lambda msg: setattr(msg, "child_frame_id", "camera_link"), "'camera_link'")])
 def test_what_a_message_does_not_hold_is_not_read_of_it(channel, value, spoil, words):
-    row = topics.topic(channel)
-    msg = row.to_message(value)
+    msg = message_of(value)
     spoil(msg)
-    with pytest.raises(PerchError, match=words):
-        row.to_value(msg)
+    if isinstance(value, ImuSample):  # as in bags
+        with pytest.raises(PerchError, match=words):
+            imu_value(msg)
     with pytest.raises(PerchError, match=words):
         topics.decode(channel, serialize_message(msg))
 

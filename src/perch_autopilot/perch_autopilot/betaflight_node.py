@@ -4,7 +4,7 @@ from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
     from perch_autopilot.betaflight import Betaflight
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
 
-NODE = node("betaflight", Betaflight)
+NODE = NodeSpec("betaflight", Betaflight)
 create, main = NODE.create, NODE.main

@@ -9,6 +9,9 @@ import re
 import select
 import socket
 import termios
+import threading
+from contextlib import suppress
+from typing import Any
 
 from perch_core.errors import PerchError
 
@@ -16,7 +19,8 @@ CONNECT_TIMEOUT = 3.0  # of the first connection to an address [s]
 REOPEN = 0.2           # from one attempt to open a link that has ended to the next [s]
 
 _SYN_RETRIES = 1       # of a later connection, which then fails after 3 s at most
-_peers: dict[str, tuple[int, tuple[str, int]]] = {}  # address -> family and socket address to which it was connected
+_peers: dict[str, tuple[int, Any]] = {}  # address -> family and socket address to which it was connected
+_resolving: set[str] = set()  # addresses whose host is being looked up, which may take seconds
 _TAKEN = "another process has this port: another node, or the link supervisor of a node that has ended"
 
 
@@ -32,7 +36,7 @@ class Link:
     """Stream of bytes to and from an autopilot.
 
     Once an address has been connected by TCP, further links to it wait neither for a name server nor for the autopilot: until they
-    are connected, nothing is read, and what is written is dropped.
+    are connected, nothing is read, and what is written is dropped. The name is resolved again meanwhile, for the next attempt.
     """
 
     def __init__(self, address: str) -> None:
@@ -136,6 +140,9 @@ def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socke
         raise PortTaken(f"{address}: {_TAKEN}") from None
     try:
         if address in _peers:
+            if address not in _resolving:
+                _resolving.add(address)
+                threading.Thread(target=_resolve, args=(address, host, port), daemon=True).start()
             connection = _connecting(*_peers[address])
         else:
             connection = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)
@@ -147,7 +154,16 @@ def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socke
     return connection, lock
 
 
-def _connecting(family: int, peer: tuple[str, int]) -> socket.socket:
+def _resolve(address: str, host: str, port: int) -> None:
+    """Look up where a host is now; its present address is kept if the name still has it, or if no name server answers."""
+    with suppress(OSError):
+        found = [(family, peer) for family, _, _, _, peer in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
+        if _peers[address] not in found:
+            _peers[address] = next((one for one in found if one[0] == _peers[address][0]), found[0])
+    _resolving.discard(address)
+
+
+def _connecting(family: int, peer: Any) -> socket.socket:
     """Begin a connection and return its socket.
 
     Raises:

@@ -9,13 +9,14 @@ Numbers are little-endian. `RAW_IMU` is in FLU; angles of `ATTITUDE` are positiv
 from __future__ import annotations
 
 import struct
+from functools import reduce
 from math import radians
+from operator import xor
 from typing import NamedTuple
 
 from perch_core.errors import PerchError
 
 FC_VARIANT, FC_VERSION, ANALOG, RAW_IMU, ATTITUDE, STATUS, SET_RAW_RC = 2, 3, 110, 102, 108, 150, 200
-LONGEST = 255
 GYRO_LSB = 16.4  # readings per deg/s: the firmware's gyros have a range of 2000 deg/s
 VERSIONS = ((4, 3), (4, 6))
 """Oldest and newest supported firmware; later versions invert the sign of yaw."""
@@ -59,22 +60,9 @@ class Frame(NamedTuple):
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
-    """Return a request as bytes.
-
-    Raises:
-        MspError: the payload is longer than a frame can be.
-    """
-    if len(payload) > LONGEST:
-        raise MspError(f"MSP {command}: {len(payload)} bytes are more than {LONGEST}")
+    """Return a request as bytes; the payload has up to 255 bytes."""
     body = bytes((len(payload), command)) + payload
-    return b"$M<" + body + bytes((_checksum(body),))
-
-
-def _checksum(body: bytes) -> int:
-    total = 0
-    for byte in body:
-        total ^= byte
-    return total
+    return b"$M<" + body + bytes((reduce(xor, body),))
 
 
 class Parser:
@@ -110,7 +98,7 @@ class Parser:
                 self._skip()
             elif len(buffer) < size + 6:
                 return found
-            elif _checksum(bytes(buffer[3:size + 5])) != buffer[size + 5]:
+            elif reduce(xor, buffer[3:size + 5]) != buffer[size + 5]:
                 self.checksum_errors += 1
                 self._skip()
             else:
@@ -189,10 +177,9 @@ def status(frame: Frame) -> Status:
 
 
 class Battery(NamedTuple):
-    """Voltage [V], charge used [mAh], strength of the radio's signal 0..1, current [A]."""
+    """Voltage [V], strength of the radio's signal 0..1, current [A]."""
 
     voltage: float
-    used: int
     rssi: float
     current: float
 
@@ -203,9 +190,9 @@ def battery(frame: Frame) -> Battery:
     Raises:
         MspError: the answer is refused or too short.
     """
-    tenths, used, rssi, current = _unpacked("<BHHh", frame)
+    tenths, rssi, current = _unpacked("<B2xHh", frame)
     voltage = _unpacked("<7xH", frame)[0] / 100.0 if len(frame.payload) >= 9 else tenths / 10.0
-    return Battery(voltage, used, min(rssi / 1023.0, 1.0), current / 100.0)
+    return Battery(voltage, min(rssi / 1023.0, 1.0), current / 100.0)
 
 
 def attitude(frame: Frame) -> tuple[float, float, float]:

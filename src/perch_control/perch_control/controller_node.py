@@ -4,7 +4,7 @@ from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
     from perch_control.controller import Controller
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
 
-NODE = node("controller", Controller, deadline="motor_command")
+NODE = NodeSpec("controller", Controller, deadline="motor_command")
 create, main = NODE.create, NODE.main

@@ -4,7 +4,7 @@ from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
     from perch_control.mission_component import Mission
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
 
-NODE = node("mission", Mission)
+NODE = NodeSpec("mission", Mission)
 create, main = NODE.create, NODE.main

@@ -4,7 +4,7 @@ from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
     from perch_core.description import Description
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
 
-NODE = node("description", Description)
+NODE = NodeSpec("description", Description)
 create, main = NODE.create, NODE.main

@@ -37,14 +37,6 @@ _GRACE = 1.0  # [s] past a job's limit, within which the supervisor must have st
 _HEADER = struct.Struct("<d")  # of a job on the pipe: its limit [s]; what follows is pickled (function, arguments)
 
 
-@dataclass(frozen=True)
-class Setup:
-    """First message to the supervisor: `path` is the caller's `sys.path`, `memory` the address space of the child [byte]."""
-
-    path: tuple[str, ...]
-    memory: int
-
-
 @dataclass
 class _Task:
     """A submitted job: the serialised call, its limit [s], its deadline on the monotonic clock [s], and the caller's future."""
@@ -71,7 +63,7 @@ class IsolatedRunner:
             command: starts the supervisor; the file descriptor of its end of the pipe and this process's id are appended.
         """
         self._preload = pickle.dumps(preload)
-        self._setup = Setup(tuple(sys.path), memory)
+        self._setup = tuple(sys.path), memory  # first message to the supervisor
         self._command = command
         self._tasks: deque[_Task] = deque()
         self._process: subprocess.Popen[bytes] | None = None

@@ -17,7 +17,7 @@ import sys
 from multiprocessing.connection import Connection, Pipe
 
 from perch_core.errors import PerchError
-from perch_core.isolated import _HEADER, Setup
+from perch_core.isolated import _HEADER
 from perch_core.processes import end_with_parent
 
 OUT_OF_MEMORY = 42
@@ -83,9 +83,8 @@ def _exit_reason(status: int, memory: int) -> str:
 
 
 def supervise(upstream: Connection) -> None:
-    """Serve a pipe until it closes: receive `Setup`, then the preload, then jobs, and have the child execute these."""
-    setup: Setup = upstream.recv()
-    sys.path[:] = setup.path
+    """Serve a pipe until it closes: receive `sys.path` and the memory of the child [byte], then the preload, then jobs for the child."""
+    sys.path[:], memory = upstream.recv()
     try:
         preload = pickle.loads(upstream.recv_bytes())
         if preload is not None:
@@ -95,7 +94,7 @@ def supervise(upstream: Connection) -> None:
         return
     gc.collect()
     gc.freeze()  # what is loaded stays shared with the children
-    pid, child = _fork(upstream, setup.memory)
+    pid, child = _fork(upstream, memory)
     upstream.send_bytes(b"ready")
     while True:
         try:
@@ -105,12 +104,12 @@ def supervise(upstream: Connection) -> None:
             return
         answer = None
         while answer is None:
-            answer, ended = _run(job, child, upstream, pid, setup.memory)
+            answer, ended = _run(job, child, upstream, pid, memory)
             if ended:
                 child.close()
                 if upstream.closed:
                     return
-                pid, child = _fork(upstream, setup.memory)
+                pid, child = _fork(upstream, memory)
         upstream.send_bytes(answer)
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from perch_core import so3
-from perch_core.values import Transform
+from perch_core.values import Transform, limits
 
 BASE = "base_link"
 FRAMES_MAX = 1000  # greatest number of frames
@@ -26,11 +24,8 @@ class StaticTransforms:
             Why it cannot be used; empty if it has been added.
         """
         name = f"transform {transform.parent!r} -> {transform.child!r}"
-        values = (*transform.p, *transform.q)
-        if len(values) != 7 or not all(math.isfinite(x) and abs(x) < 1e6 for x in values):
-            return f"{name} is not finite"
-        if abs(math.hypot(*transform.q) - 1.0) > 1e-2:
-            return f"{name} has no unit quaternion: its norm is {math.hypot(*transform.q):.3g}"
+        if problem := limits.problem(transform):
+            return f"{name}: {problem}"
         if not transform.parent or not transform.child or transform.parent == transform.child:
             return f"{name} does not name two frames"
         if len(self._poses) >= FRAMES_MAX and transform.child not in self._poses:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from perch_core.config import quantity, text
-from perch_core.ros.node import node
+from perch_core.ros.node import NodeSpec
 from perch_eval.in_process.modelled_sight import LONG_TRUTH_BUFFER, ModelledLocalizer, ModelledMap, ModelledSight
 from perch_eval.node_launch import NodeLaunch, choose_nodes, node_launches
 from perch_eval.program import Program
@@ -52,8 +52,8 @@ class TruthLocalizer(ModelledSight[SightParameters], TargetLocalizer):
         return self._sight.middle(exposure_time)
 
 
-TARGET_LOCALIZER = node("target_localizer", TruthLocalizer)
-POWERLINE_MAPPER = node("powerline_mapper", ModelledMap)
+TARGET_LOCALIZER = NodeSpec("target_localizer", TruthLocalizer)
+POWERLINE_MAPPER = NodeSpec("powerline_mapper", ModelledMap)
 NODES = {one.name: one for one in (TARGET_LOCALIZER, POWERLINE_MAPPER)}
 MODULE = "perch_eval.modelled_sight_node"
 

@@ -3,8 +3,8 @@
 from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
     from perch_eval.ros.recorder import Recorder
 
-NODE = node("recorder", Recorder)
+NODE = NodeSpec("recorder", Recorder)
 create, main = NODE.create, NODE.main

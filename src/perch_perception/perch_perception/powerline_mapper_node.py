@@ -3,8 +3,8 @@
 from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
     from perch_perception.powerline_mapper import PowerlineMapper
 
-NODE = node("powerline_mapper", PowerlineMapper)
+NODE = NodeSpec("powerline_mapper", PowerlineMapper)
 create, main = NODE.create, NODE.main

@@ -3,8 +3,8 @@
 from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
     from perch_perception.target_localizer import TargetLocalizer
 
-NODE = node("target_localizer", TargetLocalizer)
+NODE = NodeSpec("target_localizer", TargetLocalizer)
 create, main = NODE.create, NODE.main

@@ -3,8 +3,8 @@
 from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
     from perch_planner.perching_planner import PerchingPlanner
 
-NODE = node("perching_planner", PerchingPlanner)
+NODE = NodeSpec("perching_planner", PerchingPlanner)
 create, main = NODE.create, NODE.main

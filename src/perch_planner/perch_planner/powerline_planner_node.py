@@ -3,8 +3,8 @@
 from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
     from perch_planner.powerline_planner import PowerlinePlannerComponent
 
-NODE = node("powerline_planner", PowerlinePlannerComponent)
+NODE = NodeSpec("powerline_planner", PowerlinePlannerComponent)
 create, main = NODE.create, NODE.main

@@ -3,9 +3,9 @@
 from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
     from perch_sim.simulated_vehicle import SimulatedVehicle
 
-NODE = node("vehicle", SimulatedVehicle, deadline="imu", lockstep="perch_sim.ros.vehicle_node:VehicleNode",
+NODE = NodeSpec("vehicle", SimulatedVehicle, deadline="imu", lockstep="perch_sim.ros.vehicle_node:VehicleNode",
             real_time="perch_sim.ros.vehicle_node:RealTimeVehicleNode")
 create, main = NODE.create, NODE.main

@@ -3,8 +3,8 @@
 from perch_core.interrupts import quiet_on_interrupt
 
 with quiet_on_interrupt():
-    from perch_core.ros.node import node
+    from perch_core.ros.node import NodeSpec
     from perch_sim.modelled_vio import ModelledVio
 
-NODE = node("vio_model", ModelledVio)
+NODE = NodeSpec("vio_model", ModelledVio)
 create, main = NODE.create, NODE.main

@@ -39,6 +39,8 @@ LOCKSTEP = "perch_sim.ros.participant_node:ParticipantNode"  # the simulator's h
 class NodeSpec:
     """A node that can be started.
 
+    Node files have `NODE = NodeSpec("controller", Controller)` and `create, main = NODE.create, NODE.main`.
+
     Attributes:
         name: name of the node and its executable.
         component: class of the component.
@@ -72,12 +74,6 @@ class NodeSpec:
     def main(self) -> None:
         """Entry point of the executable: run until SIGINT or SIGTERM; exit code 0, or 2 when parameters are refused."""
         run(lambda wiring: [self.create(wiring)], None)
-
-
-def node(name: str, component: type[Component[Any]], deadline: str = "", lockstep: str = LOCKSTEP,
-         choose: Callable[[str], type[Component[Any]]] | None = None, real_time: str = REAL_TIME) -> NodeSpec:
-    """Return a `NodeSpec`. Node files have `NODE = node("controller", Controller)` and `create, main = NODE.create, NODE.main`."""
-    return NodeSpec(name, component, deadline, lockstep, choose, real_time)
 
 
 @contextmanager

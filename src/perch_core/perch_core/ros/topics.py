@@ -5,7 +5,6 @@ A new topic needs a new row. Ports name channels (`perch_core.component`); hosts
 
 from __future__ import annotations
 
-import importlib.util
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,6 +34,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
 Convert = Callable[[Any], Any]
@@ -54,7 +54,7 @@ class Topic:
         observed: for observers only; no component in flight waits for it.
         size_max: greatest size of a message that is read [bytes].
         rate_max: greatest number of messages per second that a node reads; 0: no limit.
-        pack, unpack: value to serialised message and back without rclpy's objects, for topics at 500 Hz.
+        packed: `to_message` returns the serialised message and `to_value` reads it, without rclpy's objects, for topics at 500 Hz.
         """
 
     channel: str
@@ -62,8 +62,7 @@ class Topic:
     qos: Qos
     to_message: Convert
     to_value: Convert
-    pack: Callable[[Any], bytes] | None = None
-    unpack: Callable[[bytes], Any] | None = None
+    packed: bool = False
     observed: bool = False
     size_max: int = 256 << 10
     rate_max: int = 0
@@ -76,8 +75,8 @@ class Topic:
         """
         if len(data) > self.size_max:
             raise PerchError(f"{len(data)} bytes are more than {self.size_max}")
-        if self.unpack is not None:
-            return self.unpack(data)
+        if self.packed:
+            return self.to_value(data)
         try:
             message = deserialize_message(data, self.message)
         except rclpy_implementation.RMWError as error:
@@ -91,18 +90,15 @@ class Topic:
 
 
 TOPICS = (
-    Topic("imu/data_raw", Imu, qos.SENSOR, sensing.imu_message, sensing.imu_value,
-          fast.pack_imu, fast.unpack_imu),
+    Topic("imu/data_raw", Imu, qos.SENSOR, fast.pack_imu, fast.unpack_imu, packed=True),
     Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.image_message, sensing.image_value, size_max=IMAGE_MAX, rate_max=300),
     Topic("camera_*/image_raw/compressed", CompressedImage, qos.IMAGE, sensing.compressed_message, sensing.compressed_value, size_max=IMAGE_MAX,
           rate_max=300),
     Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value, rate_max=300),
     Topic("vio/debug_image", Image, qos.IMAGE, sensing.image_message, sensing.image_value, size_max=IMAGE_MAX),
-    Topic("vio/odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
-          fast.pack_odometry, fast.unpack_odometry),
+    Topic("vio/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
     Topic("vio/state", VioState, qos.SENSOR, states.inertial_message, states.inertial_value),
-    Topic("odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
-          fast.pack_odometry, fast.unpack_odometry),
+    Topic("odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
     Topic("estimator/status", EstimatorStatus, qos.STATE, states.health_message, states.health_value),
     Topic("target/pose", PoseWithCovarianceStamped, qos.LATCHED, perching.target_message, perching.target_value, rate_max=500),
     Topic("target/detections", TargetDetection, qos.STATE, perching.sighting_message, perching.sighting_value),
@@ -112,19 +108,20 @@ TOPICS = (
     Topic("controller/command", ControllerCommand, qos.ORDER, flight.command_message, flight.command_value, rate_max=500),
     Topic("controller/status", ControllerStatus, qos.STATE, flight.status_message, flight.status_value),
     Topic("controller/reference", ControlReference, qos.STATE, flight.reference_message, flight.reference_value, observed=True),
-    Topic("motor_command", MotorCommand, qos.SENSOR, flight.motor_message, flight.motor_value,
-          fast.pack_motor, fast.unpack_motor),
-    Topic("rates_thrust_command", RatesThrust, qos.SENSOR, flight.rates_message, flight.rates_value, fast.pack_rates, fast.unpack_rates),
-    Topic("attitude_thrust_command", AttitudeThrust, qos.SENSOR, flight.attitude_message, flight.attitude_value,
-          fast.pack_attitude, fast.unpack_attitude),
+    Topic("motor_command", MotorCommand, qos.SENSOR, fast.pack_motor, fast.unpack_motor, packed=True),
+    Topic("rates_thrust_command", RatesThrust, qos.SENSOR, fast.pack_rates, fast.unpack_rates, packed=True),
+    Topic("attitude_thrust_command", AttitudeThrust, qos.SENSOR, fast.pack_attitude, fast.unpack_attitude, packed=True),
     Topic("rotor_state", RotorState, qos.SENSOR, states.rotors_message, states.rotors_value, observed=True),
     Topic("contact", Contact, qos.EVENT, states.contact_message, states.contact_value),
-    Topic("ground_truth/odometry", Odometry, qos.SENSOR, states.odometry_message, states.odometry_value,
-          fast.pack_odometry, fast.unpack_odometry, observed=True),
+    Topic("ground_truth/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True, observed=True),
     Topic("ground_truth/target", PoseStamped, qos.LATCHED, states.pose_message, states.pose_value),
     Topic("/clock", Clock, qos.CLOCK, lambda stamp: Clock(clock=to_stamp(stamp)), lambda msg: stamp_value(msg.clock), observed=True),
     Topic("/diagnostics", DiagnosticArray, qos.STATE, diagnostics_message, diagnostics_value),
     Topic("markers", MarkerArray, qos.STATE, markers.markers_message, markers.markers_value),
+    Topic("/tf", TFMessage, qos.SENSOR, lambda value: TFMessage(transforms=[sensing.stamped_transform_message(value)]),
+          lambda msg: [sensing.stamped_transform_value(one) for one in msg.transforms]),
+    Topic("/tf_static", TFMessage, qos.STATIC, lambda value: TFMessage(transforms=[sensing.transform_message(value)]),
+          lambda msg: [sensing.transform_value(one) for one in msg.transforms]),
     Topic("robot_description", String, qos.LATCHED, lambda text: String(data=text), lambda msg: msg.data),
 )
 
@@ -173,15 +170,6 @@ class ActionRow:
 ACTIONS = (ActionRow("perch", Perch, mission.goal_value, mission.feedback_message, mission.result_message, mission.rejected),)
 
 
-def _rows() -> tuple[Topic, ...]:
-    """Return all rows; those of TF only if `tf2_msgs` is installed."""
-    if importlib.util.find_spec("tf2_msgs") is None:
-        return TOPICS
-    from perch_core.ros.messages import transforms
-
-    return (*TOPICS, *transforms.topics())
-
-
 @lru_cache(maxsize=None)
 def topic(channel: str) -> Topic:
     """Return the row of a channel.
@@ -190,7 +178,7 @@ def topic(channel: str) -> Topic:
         PerchError: there is no such channel.
     """
     parts = channel.split("/")
-    for row in _rows():
+    for row in TOPICS:
         pattern = row.channel.split("/")
         if len(pattern) == len(parts) and all(w == p or (w.endswith("*") and p.startswith(w[:-1])) for w, p in zip(pattern, parts)):
             return row
@@ -215,7 +203,9 @@ def message_type(channel: str) -> Any:
 def encode(channel: str, value: Any) -> bytes:
     """Serialise a value as a message of its channel."""
     row = topic(channel)
-    return row.pack(value) if row.pack is not None else serialize_message(row.to_message(value))
+    message = row.to_message(value)
+    data: bytes = message if row.packed else serialize_message(message)
+    return data
 
 
 def decode(channel: str, data: bytes) -> Any:

@@ -259,9 +259,13 @@ POSE: dict[str, Limit | Unit] = {"position": POSITION, "orientation": Unit(1e-2)
 
 def problem(value: Any) -> str:
     """Return why a value is invalid, as `field: reason`; empty: valid, or no limits for its type. Runs at every IMU sample."""
+    global _last_valid
+    if value is _last_valid:
+        return ""
     kind = type(value)
     try:
         if kind in _FAST_CHECKS and _FAST_CHECKS[kind](value):
+            _last_valid = value
             return ""
     except (AttributeError, IndexError, TypeError, ValueError):  # of other sizes or kinds
         pass
@@ -269,6 +273,9 @@ def problem(value: Any) -> str:
         if (entry := getattr(value, name)) is not None and (reason := limit.problem(entry)):
             return f"{name}{reason}" if reason[0] == "[" else f"{name}: {reason}"
     return ""
+
+
+_last_valid: Any = None  # that passed a fast check: the other receivers in its process take the same object
 
 
 def check(source: str, values: Any, limits: dict[str, Any] | None = None) -> None:

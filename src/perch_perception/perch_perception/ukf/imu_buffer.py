@@ -5,11 +5,11 @@ from __future__ import annotations
 import enum
 from bisect import bisect_right
 from collections import deque
+from math import hypot
 
 import numpy as np
 
 from perch_core.values import ImuSample
-from perch_core.vector3 import norm
 from perch_perception.ukf.config import ImuNoise
 
 _GAP = 3.0  # longest interval between samples that counts as complete, in periods
@@ -141,9 +141,9 @@ class ImuBuffer:
             # the error persists over the gap: its variance must not average out over the one long step
             more_gyro, more_accel, outcome = _GAP_GYRO**2, _GAP_ACCEL**2, ImuOutcome.GAP
         ends = (sample, last) if self._instant else (sample,)  # what the step is made of
-        if max(norm(s.w_B) for s in ends) >= 0.99 * imu.gyro_range:  # B's axes need not be the sensor's
+        if max(hypot(*s.w_B) for s in ends) >= 0.99 * imu.gyro_range:  # B's axes need not be the sensor's
             more_gyro, outcome = more_gyro + imu.gyro_range**2, ImuOutcome.SATURATED  # it may be off by as much again
-        if max(norm(s.f_B) for s in ends) >= 0.99 * imu.accel_range:
+        if max(hypot(*s.f_B) for s in ends) >= 0.99 * imu.accel_range:
             more_accel, outcome = more_accel + imu.accel_range**2, ImuOutcome.SATURATED
         self._ends.append(sample.stamp)
         self._rows.append((dt, *w, *f, gyro + more_gyro, accel + more_accel))

@@ -38,16 +38,6 @@ def require_measured(gyro: float, accelerometer: float) -> None:
         raise PerchError(f"imu: no {missing} (covariance -1): both must be in one message")
 
 
-def require_body(child_frame: str) -> None:
-    """Check the child frame of an `Odometry`, to which pose and twist refer.
-
-    Raises:
-        PerchError: it is not the body frame.
-    """
-    if child_frame not in ("base_link", ""):
-        raise PerchError(f"odometry: child_frame_id is {child_frame!r}: pose and twist must be those of base_link")
-
-
 def floats(v: Vector3 | Point) -> tuple[float, float, float]:
     """Vector or point as 3 floats."""
     return (v.x, v.y, v.z)

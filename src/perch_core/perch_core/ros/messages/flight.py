@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 from perch_core.errors import PerchError
-from perch_core.ros.messages.basic import floats, header, quaternion_floats, stamp_value, to_pose, to_quaternion, to_vector
+from perch_core.ros.messages.basic import floats, header, quaternion_floats, stamp_value, to_pose, to_vector
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
-    AtEnd, AttitudeThrust, ControllerCommand, ControllerStatus, ControlReference, MotorCommand, RatesThrust, SetControllerRequest,
-    SetControllerResponse, TrajectoryOrder, TriggerRequest, TriggerResponse, nanoseconds, seconds)
-from perch_msgs.msg import AttitudeThrust as AttitudeMessage
+    AtEnd, ControllerCommand, ControllerStatus, ControlReference, SetControllerRequest, SetControllerResponse, TrajectoryOrder, TriggerRequest,
+    TriggerResponse, nanoseconds, seconds)
 from perch_msgs.msg import ControllerCommand as CommandMessage
 from perch_msgs.msg import ControllerStatus as StatusMessage
 from perch_msgs.msg import ControlReference as ReferenceMessage
-from perch_msgs.msg import MotorCommand as MotorMessage
 from perch_msgs.msg import PolynomialSegment, Trajectory, TrajectoryPoint
-from perch_msgs.msg import RatesThrust as RatesMessage
 from perch_msgs.srv import SetController
 from std_srvs.srv import Trigger
 
@@ -105,40 +102,6 @@ def command_message(command: ControllerCommand) -> CommandMessage:
 def command_value(msg: CommandMessage) -> ControllerCommand:
     """Convert from `perch_msgs/ControllerCommand`."""
     return ControllerCommand(stamp_value(msg.header.stamp), msg.command, msg.reason)
-
-
-def motor_message(command: MotorCommand) -> MotorMessage:
-    """Convert to `perch_msgs/MotorCommand`."""
-    msg = MotorMessage(header=header(command.stamp, "base_link"), armed=bool(command.armed))
-    msg.rotor_speed = np.array(command.rotor_speed, float)
-    return msg
-
-
-def motor_value(msg: MotorMessage) -> MotorCommand:
-    """Convert from `perch_msgs/MotorCommand`."""
-    return MotorCommand(stamp_value(msg.header.stamp), msg.armed, tuple(msg.rotor_speed.tolist()))
-
-
-def rates_message(command: RatesThrust) -> RatesMessage:
-    """Convert to `perch_msgs/RatesThrust`."""
-    return RatesMessage(header=header(command.stamp, "base_link"), armed=bool(command.armed), body_rates=to_vector(command.w_B),
-                        thrust=float(command.thrust))
-
-
-def rates_value(msg: RatesMessage) -> RatesThrust:
-    """Convert from `perch_msgs/RatesThrust`."""
-    return RatesThrust(stamp_value(msg.header.stamp), msg.armed, floats(msg.body_rates), msg.thrust)
-
-
-def attitude_message(command: AttitudeThrust) -> AttitudeMessage:
-    """Convert to `perch_msgs/AttitudeThrust`."""
-    return AttitudeMessage(header=header(command.stamp, FRAME), armed=bool(command.armed), attitude=to_quaternion(command.q_WB),
-                           body_rates=to_vector(command.w_B), thrust=float(command.thrust))
-
-
-def attitude_value(msg: AttitudeMessage) -> AttitudeThrust:
-    """Convert from `perch_msgs/AttitudeThrust`."""
-    return AttitudeThrust(stamp_value(msg.header.stamp), msg.armed, quaternion_floats(msg.attitude), floats(msg.body_rates), msg.thrust)
 
 
 def status_message(status: ControllerStatus) -> StatusMessage:

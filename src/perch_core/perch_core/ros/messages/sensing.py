@@ -21,16 +21,9 @@ _GENERIC = {"8UC1": "mono8", "8UC3": "bgr8"}  # what the bytes mean in ROS' gene
 
 
 def imu_value(msg: Imu) -> ImuSample:
-    """Convert `sensor_msgs/Imu` to a sample; PerchError if a measurement is missing."""
+    """Convert a recorded `sensor_msgs/Imu` to a sample; PerchError if a measurement is missing."""
     require_measured(msg.angular_velocity_covariance[0], msg.linear_acceleration_covariance[0])
     return ImuSample(stamp_value(msg.header.stamp), floats(msg.angular_velocity), floats(msg.linear_acceleration), msg.header.frame_id)
-
-
-def imu_message(sample: ImuSample) -> Imu:
-    """Convert a sample to `sensor_msgs/Imu`, without orientation."""
-    msg = Imu(header=header(sample.stamp, sample.frame), angular_velocity=to_vector(sample.w_B), linear_acceleration=to_vector(sample.f_B))
-    msg.orientation_covariance[0] = -1.0  # sensor_msgs: no orientation
-    return msg
 
 
 def image_value(msg: Image) -> CameraImage:

@@ -1,34 +1,15 @@
-"""Conversions of odometry, VIO's state, the estimator's health, and ground truth."""
+"""Conversions of VIO's state, the estimator's health, and ground truth."""
 
 from __future__ import annotations
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped as PoseStampedMessage
-from nav_msgs.msg import Odometry
 from perch_core.ros.messages.basic import (
-    flat, floats, header, quaternion_floats, require_body, square, stamp_value, to_point, to_pose, to_quaternion, to_vector)
-from perch_core.values import Contact, EstimatorHealth, InertialState, OdometryState, PoseStamped, RotorState
+    flat, floats, header, quaternion_floats, square, stamp_value, to_point, to_pose, to_quaternion, to_vector)
+from perch_core.values import Contact, EstimatorHealth, InertialState, PoseStamped, RotorState
 from perch_msgs.msg import Contact as ContactMessage
 from perch_msgs.msg import EstimatorStatus, VioState
 from perch_msgs.msg import RotorState as RotorStateMessage
-
-
-def odometry_value(msg: Odometry) -> OdometryState:
-    """Convert `nav_msgs/Odometry` to a state; PerchError if it is not that of the body."""
-    require_body(msg.child_frame_id)
-    pose, twist = msg.pose.pose, msg.twist.twist
-    return OdometryState(
-        stamp_value(msg.header.stamp), floats(pose.position), quaternion_floats(pose.orientation), floats(twist.linear), floats(twist.angular),
-        square(msg.pose.covariance, 6), square(msg.twist.covariance, 6), msg.header.frame_id)
-
-
-def odometry_message(state: OdometryState) -> Odometry:
-    """Convert a state to `nav_msgs/Odometry`."""
-    msg = Odometry(header=header(state.stamp, state.frame), child_frame_id="base_link")
-    msg.pose.pose = to_pose(state.p_WB, state.q_WB)
-    msg.twist.twist.linear, msg.twist.twist.angular = to_vector(state.v_B), to_vector(state.w_B)
-    msg.pose.covariance, msg.twist.covariance = flat(state.pose_covariance), flat(state.twist_covariance)
-    return msg
 
 
 def inertial_value(msg: VioState) -> InertialState:
