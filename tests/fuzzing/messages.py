@@ -42,7 +42,7 @@ FREE: dict[str, tuple[str, ...]] = {
     "Imu": ("orientation", "angular_velocity_covariance", "linear_acceleration_covariance"),
     "EstimatorStatus": ("header", "vio_age", "updates", "nis", "gyro_bias", "accel_bias", "position_sigma", "attitude_sigma"),
     "ControllerStatus": ("header", "trajectory_duration", "position_error", "odometry_age", "thrust_margin", "thrust_ratio"),
-    "ControllerCommand": ("header",), "MotorCommand": ("header",), "PowerlineArray": ("lines.0.covariance",),
+    "ControllerCommand": ("header",), "MotorCommand": ("header",), "RotorState": ("header",), "PowerlineArray": ("lines.0.covariance",),
     "CameraInfo": ("header", "r", "p", "roi", "binning"), "Image": ("header.frame_id",), "TFMessage": ("transforms.0.header", "transforms.0.child_frame_id"),
     "Odometry": ("child_frame_id", "pose.covariance", "twist.covariance"), "Trajectory": ("recovery_start",), "VioState": (),
 }

@@ -360,6 +360,30 @@ def test_a_disarm_and_an_arm_between_two_reports_arm(flown_on, monkeypatch):
     assert polled(node, 2.5, 100, 9.81) == []
 
 
+def test_rotors_are_reported_to_stand_only_while_it_is_disarmed_and_no_command_has_them_on(flown_on, monkeypatch):
+    node, reports = flown_on(16.0), []
+    node.rotors.receivers.append(reports.append)
+
+    def reported(start: float, **armed: float) -> list:
+        """The reports after half a second of polls from a time [s]: the state is requested three times a second."""
+        polled(node, start, 50, **armed)
+        reports.clear()
+        polled(node, start + 0.5, 100, **armed)
+        return [(report.speed, report.thrust) for report in reports]
+
+    standing = [((0.0,) * 4, (0.0,) * 4)] * 10
+    assert reported(1.0) == standing
+    assert reported(3.0, thrust=9.81) == []              # it may arm at any moment
+    assert not obeyed(node, False) and reported(5.0) == standing
+    monkeypatch.setattr(StubAutopilot, "armed", True)    # by its pilot
+    assert reported(7.0) == []
+    monkeypatch.setattr(StubAutopilot, "armed", False)
+    assert reported(9.0) == standing
+    monkeypatch.setattr(StubAutopilot, "silent", True)
+    reported(11.0)
+    assert reported(12.5) == []
+
+
 def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):
     node, reports, samples = flown_on(16.0), [], []
     node.diagnostics.receivers.append(reports.append)

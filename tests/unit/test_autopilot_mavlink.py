@@ -215,6 +215,24 @@ def autopilot():
     one.link.close()
 
 
+def test_rotors_are_reported_to_stand_only_while_it_is_disarmed_and_no_command_has_them_on(autopilot):
+    def reported(armed: bool | None, wanted: bool) -> list:
+        if armed is not None:
+            autopilot.say(autopilot.mavlink.heartbeat_encode(2, PX4, ARMED * armed, 0, 4))
+        autopilot.node.on_rates_thrust(RatesThrust(0, wanted, (0.0, 0.0, 0.0), 9.81 * wanted))
+        autopilot.heard(0.01)
+        autopilot.got["rotors"].clear()
+        autopilot.heard(1.0)
+        return [(report.speed, report.thrust) for report in autopilot.got["rotors"]]
+
+    standing = [((0.0,) * 4, (0.0,) * 4)] * 10
+    assert reported(False, False) == standing
+    assert reported(False, True) == reported(True, True) == reported(True, False) == []
+    assert reported(False, False) == standing
+    reported(None, False)
+    assert reported(None, False) == []                   # no heartbeat for two seconds
+
+
 def test_commands_leave_in_the_axes_of_aviation_and_never_stale(autopilot):
     vehicle = load_vehicle("snapdragon_rates")
     autopilot.heard()

@@ -28,7 +28,7 @@ from perch_eval.camera_clip import clip
 from perch_eval.flight import Flight, timed
 from perch_eval.flight_view import FlightView
 from perch_eval.mcap_log import read
-from perch_eval.metrics import figures, flight_metrics, perch_window, rates
+from perch_eval.metrics import figures, flight_metrics, perch_window, rates, thrust_history
 from perch_eval.page import Html, section, table
 from perch_eval.replay import animation, command
 from perch_eval.replay.command import main
@@ -56,6 +56,14 @@ def test_figures_are_what_was_put_in(recorded):
     assert found["max_body_rate_deg_s"] == pytest.approx(math.degrees(0.5))
     assert (found["contact"]["state"], found["contact"]["body"], found["contact"]["normal_speed_m_s"]) == ("attached", "pad", 0.7)
     assert rates(flight)["odometry"] == pytest.approx(500.0) and rates(flight)["rotor_state"] == pytest.approx(100.0)
+
+
+def test_rotors_that_are_reported_only_while_they_stand_are_no_thrust_in_flight():
+    """As the nodes of autopilots report them."""
+    channels, vehicle = flown(), load_vehicle("snapdragon")
+    assert len(thrust_history(Flight(channels), vehicle)[0]) > 100
+    channels["rotor_state"] = [(t, rotors._replace(speed=(0.0,) * 4, thrust=(0.0,) * 4)) for t, rotors in channels["rotor_state"][:9]]
+    assert len(thrust_history(Flight(channels), vehicle)[0]) == 0
 
 
 def test_figures_are_of_the_attempt_that_touched_and_of_what_is_known():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from perch_core import so3
+from perch_core.values import RotorState
 from perch_perception.ukf.stillness import is_at_rest
 from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioOutcome, VioPose
 
@@ -37,6 +38,7 @@ class Resting:
         reads[:, 3:] += force
         for read in reads.tolist():
             self.k += 1
+            self.estimator.add_rotors(RotorState(self.k * PERIOD, (0.0,) * 4, (0.0,) * 4))
             self.estimator.add_imu(ImuSample(self.k * PERIOD, tuple(read[:3]), tuple(read[3:])))
         return self
 
@@ -122,8 +124,8 @@ def test_rest_is_in_the_variance_whatever_the_biases(rate, turn):
     assert all(seen)
 
 
-def flown_without_vio(coasting, R_WB, vibration):
-    """At 1 m/s, then it brakes and is still; VIO ends before. `vibration`: of the accelerometer in flight [m/s^2].
+def flown_without_vio(coasting, R_WB, vibration, speed=None):
+    """At 1 m/s, then it brakes and is still; VIO ends before. `vibration`: of the accelerometer in flight [m/s^2]; `speed`: of the rotors, as reported [rad/s].
 
     Returns:
         The estimate, and the position along x.
@@ -134,6 +136,8 @@ def flown_without_vio(coasting, R_WB, vibration):
         a = 2.5 if 0.3 < t <= 0.7 else -5.0 if 1.0 + coasting < t <= 1.2 + coasting else 0.0
         p, v = p + 0.002 * v + 0.5 * a * 0.002**2, v + 0.002 * a
         shaken = vibration if 0.3 < t <= 1.2 + coasting else 0.335
+        if speed is not None:
+            estimator.add_rotors(RotorState(2_000_000 * k, (speed,) * 4, (0.0,) * 4))
         estimator.add_imu(ImuSample(2_000_000 * k, tuple(rng.normal(0.0, 0.011, 3)), tuple(rng.normal(R_WB.T @ [a, 0.0, 9.81], shaken))))
         if t <= 1.0 and k > 100 and k % 16 == 0:
             estimator.add_vio(VioPose(2_000_000 * k, np.array([p, 0.0, 1.0]), so3.quat_from_matrix(R_WB), 1e-5 * np.eye(6),
@@ -144,13 +148,15 @@ def flown_without_vio(coasting, R_WB, vibration):
 @pytest.mark.parametrize("coasting", [0.6, 1.0, 2.5])
 def test_a_flight_without_vio_before_the_rest_is_not_left_out(coasting):
     """The IMU that is kept is shorter than the flight, which ends on a wall."""
-    found, p = flown_without_vio(coasting, so3.exp(ATTITUDES["wall"]), vibration=1.0)
+    found, p = flown_without_vio(coasting, so3.exp(ATTITUDES["wall"]), vibration=1.0, speed=0.0)
     assert abs(found.v_WB[0]) < 0.01 and abs(found.p_WB[0] - p) < 3.0 * np.sqrt(found.P[0, 0])
 
 
-def test_a_vehicle_that_has_flown_may_hover_where_its_imu_is_quiet():
+@pytest.mark.parametrize("R_WB", [np.eye(3), so3.exp(ATTITUDES["wall"])], ids=["z up", "any axes"])
+@pytest.mark.parametrize("speed", [None, 600.0])
+def test_a_vehicle_that_has_flown_may_hover_where_its_imu_is_quiet(speed, R_WB):
     """The noise of the sensor file includes the vibration of flight."""
-    found, _ = flown_without_vio(1.0, np.eye(3), vibration=0.335)
+    found, _ = flown_without_vio(1.0, R_WB, vibration=0.335, speed=speed)
     assert np.sqrt(np.diag(found.P)[3:6]).min() > 0.02
 
 

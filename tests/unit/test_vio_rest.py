@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from perch_core import so3
+from perch_core.values import RotorState
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import ImuSample
 from perch_perception.vio import FrameOutcome, VioConfig, VisualInertialOdometry
@@ -27,10 +28,15 @@ def textured(rng, noise=2.0):
     return lambda frame: some[frame % 4]
 
 
-def outcomes(climb, drop, until=2.6, idle=0.0):
+def rotors(stamp, turn):
+    """Rotors that idle, or stand."""
+    return RotorState(stamp, (600.0 * turn,) * 4, (0.4 * turn,) * 4)
+
+
+def outcomes(climb, drop, until=2.6, idle=0.0, turn=lambda t: None):
     """Frames over a blank floor: rest for 1 s, `climb` and `drop` [m/s^2] for 0.1 s each, then nothing more; (time, outcome, height).
 
-    Rotors shake the vehicle from the end of the rest for a time `idle` [s].
+    Rotors shake the vehicle from the end of the rest for a time `idle` [s]; `turn(t)`: whether they are reported to turn, None: no report.
     """
     rng, mount = np.random.default_rng(1), load_vehicle("snapdragon").mounts["down"]
     vio, out, frame, image = VisualInertialOdometry(VioConfig(), mount), [], 0.1, blank(rng)
@@ -39,6 +45,8 @@ def outcomes(climb, drop, until=2.6, idle=0.0):
         up = 9.81 + (climb if 1.0 <= t < 1.1 else drop if 1.1 <= t < 1.2 else 0.0)
         shake = 1.0 if 1.0 <= t < 1.0 + idle else 0.05
         vio.add_imu(ImuSample(k * 2 * MS, tuple(rng.normal(0, 0.002, 3)), tuple(rng.normal(0, shake, 3) + [0, 0, up])))
+        if turn(t) is not None:
+            vio.add_rotors(rotors(k * 2 * MS, turn(t)))
         if t > frame + 0.02:
             result = vio.add_image(round(frame * 1e9), image(len(out)))
             out.append((frame, result.outcome, vio.filter.state.p_WB[2] if vio.filter else 0.0))
@@ -48,24 +56,27 @@ def outcomes(climb, drop, until=2.6, idle=0.0):
 
 @pytest.mark.slow
 def test_a_shake_on_the_ground_is_rest_again():
-    seen = outcomes(climb=1.5, drop=-1.5)
+    seen = outcomes(climb=1.5, drop=-1.5, turn=lambda t: False)
     assert {o for t, o, _ in seen if 0.5 < t < 1.0} == {FrameOutcome.RESTING}
     assert any(o is not FrameOutcome.RESTING for t, o, _ in seen if 1.0 < t < 1.3)
     assert {o for t, o, _ in seen if t > 1.8} == {FrameOutcome.RESTING}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("climb, rests", [(0.0, True), (6.0, False)])
-def test_rotors_that_idled_on_the_ground_in_the_dark_leave_it_at_rest_a_take_off_does_not(climb, rests):
+@pytest.mark.parametrize("climb, turn, rests", [
+    (0.0, lambda t: 1.0 < t < 2.6, True), (0.0, lambda t: t > 1.0, False), (0.0, lambda t: None, False), (6.0, lambda t: t > 1.0, False),
+    (0.0, lambda t: False if t < 1.0 else None, False)], ids=["stopped", "idle", "no report", "taken off", "an old report"])
+def test_rotors_that_idled_on_the_ground_in_the_dark_leave_it_at_rest_once_they_stand(climb, turn, rests):
     """For longer than vision may be missing at a take-off."""
-    seen = outcomes(climb, -climb, until=4.0, idle=1.6)
+    seen = outcomes(climb, -climb, until=4.0, idle=1.6, turn=turn)
     assert any(o is FrameOutcome.BLIND for t, o, _ in seen if 2.0 < t < 2.6)
     assert {o for t, o, _ in seen if t > 3.0} == {FrameOutcome.RESTING if rests else FrameOutcome.BLIND}
 
 
-def test_a_steady_climb_is_not_rest():
+@pytest.mark.parametrize("turn", [None, True, False], ids=["no report", "flown", "carried"])
+def test_a_steady_climb_is_not_rest(turn):
     """Nothing to see and a quiet IMU, but a velocity that the filter knows: it was told to have stopped, and to be back on the ground."""
-    seen = outcomes(climb=3.0, drop=0.0)
+    seen = outcomes(climb=3.0, drop=0.0, turn=lambda t: turn and t > 1.0)
     late = [(o, z) for t, o, z in seen if t > 1.5]
     assert not any(o is FrameOutcome.RESTING for o, _ in late)
     assert late[-1][1] == pytest.approx(0.015 + 0.3 * (seen[-1][0] - 1.1), abs=0.05)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_core.imu_axes import ImuAxes
-from perch_core.values import ImuSample, Transform
+from perch_core.values import ImuSample, RotorState, Transform
 from perch_core.vehicle import GRAVITY, load_vehicle
 from perch_eval.perch_motion import PerchMotion, read_imu
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
@@ -208,13 +208,14 @@ def test_an_unknown_heading_does_not_end_the_filter():
 
 
 SEEN, DARK = np.random.default_rng(5).uniform([40, 40], [600, 440], (60, 2)), np.zeros((0, 2))
+NOSE = so3.exp(np.array([0.0, 1.4, 0.0]))
 
 
-def unaccelerated(pixels, drift=0.0, R_WB=np.eye(3), has_flown=True, height=0.3):
+def unaccelerated(pixels, drift=0.0, R_WB=np.eye(3), has_flown=True, speed=None):
     """Outcomes of 1.2 s of a vehicle without acceleration, whose tracks, at these pixels, drift [px/s].
 
     Its filter has had no vision for half a second, with a velocity of 12 +- 3 cm/s, at a height above where it started; or, has it not
-    flown, it starts there.
+    flown, it starts there. Its rotors are reported to turn at a speed [rad/s].
     """
     rng, vio, out, frame = np.random.default_rng(3), VisualInertialOdometry(VioConfig(), MOUNT, floor=-0.04), [], 0.3
     vio.tracker = GivenTracks(lambda: (np.arange(len(pixels)), pixels + [drift * frame, 0.0]))
@@ -222,8 +223,10 @@ def unaccelerated(pixels, drift=0.0, R_WB=np.eye(3), has_flown=True, height=0.3)
     for k in range(750):
         read = noise * rng.normal(size=6) + np.r_[np.zeros(3), R_WB.T @ [0.0, 0.0, GRAVITY]]
         vio.add_imu(ImuSample(2_000_000 * k, tuple(read[:3]), tuple(read[3:])))
+        if speed is not None:
+            vio.add_rotors(RotorState(2_000_000 * k, (speed,) * 4, (0.0,) * 4))
         if k == 140 and has_flown:
-            pose, v_WB = configured_pose(np.array([0.0, 0.0, height]), 0.0), np.array([0.12, 0.0, 0.0])
+            pose, v_WB = configured_pose(np.array([0.0, 0.0, 0.3]), 0.0), np.array([0.12, 0.0, 0.0])
             vio._begin(initial_state(vio.config, MOUNT, 280_000_000, R_WB, pose, v_WB, np.zeros(3), 0.005, 0.03, 0.001))
             vio._last_visual_update = 0
         if 0.002 * k > frame + 0.02:
@@ -233,11 +236,12 @@ def unaccelerated(pixels, drift=0.0, R_WB=np.eye(3), has_flown=True, height=0.3)
 
 
 @pytest.mark.parametrize("rests, pixels, case", [
-    (False, DARK, {}), (True, DARK, dict(R_WB=so3.exp(np.array([0.0, 1.4, 0.0])))), (True, DARK, dict(has_flown=False)),
-    (True, DARK, dict(height=0.0)), (False, SEEN, dict(drift=2.5)), (True, SEEN, {})],
-    ids=["dark", "on a wall", "not flown", "on the floor", "static for a moment", "static"])
+    (False, DARK, {}), (False, DARK, dict(R_WB=NOSE)), (True, DARK, dict(R_WB=NOSE, speed=0.0)), (True, DARK, dict(has_flown=False)),
+    (False, DARK, dict(has_flown=False, speed=600.0)), (True, DARK, dict(speed=0.0)), (False, DARK, dict(speed=600.0)),
+    (False, SEEN, dict(drift=2.5)), (False, SEEN, dict(drift=10.0, speed=0.0)), (True, SEEN, {})],
+    ids=["dark", "x up", "on a wall", "not flown", "not flown, rotors turn", "landed", "flown", "static for a moment", "carried", "static"])
 def test_a_quiet_imu_is_no_rest_where_it_may_be_a_hover(rests, pixels, case):
-    """The noise of the sensor file includes the vibration of flight: a smooth hover is as quiet. None is on its nose."""
+    """The noise of the sensor file includes the vibration of flight: a smooth hover is as quiet. The axes of B may be any IMU's."""
     assert (FrameOutcome.RESTING in unaccelerated(pixels, **case)) is rests
 
 
@@ -257,10 +261,10 @@ def test_after_images_were_missing_a_rest_is_one_in_the_image_for_long(drift, re
     assert any(resting for t, resting in out if t < 1.0) and any(resting for t, resting in out if t > 7.0) is rests
 
 
-def after_loss(change=lambda state: None, drift=0.0, shake=1.0, image=BLANK, count=60):
+def after_loss(change=lambda state: None, drift=0.0, shake=1.0, image=BLANK, count=60, speed=None):
     """Results of 1.2 s after a loss in a hover of a filter whose state was changed; the IMU is quiet but for `shake` times its noise.
 
-    The view drifts by `drift` [px/s].
+    The view drifts by `drift` [px/s], and the rotors are reported to turn at a speed [rad/s].
     """
     rng, vio, out, frame = np.random.default_rng(3), VisualInertialOdometry(VioConfig(), MOUNT), [], 0.3
     pixels, imu = rng.uniform([40, 40], [600, 440], (60, 2))[:count], VioConfig().imu
@@ -269,6 +273,8 @@ def after_loss(change=lambda state: None, drift=0.0, shake=1.0, image=BLANK, cou
     for k in range(750):
         read = noise * rng.normal(size=6) + [0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY]
         vio.add_imu(ImuSample(2_000_000 * k, tuple(read[:3]), tuple(read[3:])))
+        if speed is not None:
+            vio.add_rotors(RotorState(2_000_000 * k, (speed,) * 4, (0.0,) * 4))
         if k == 140:
             pose = configured_pose(np.zeros(3), 0.0)
             vio._begin(initial_state(vio.config, MOUNT, 280_000_000, np.eye(3), pose, np.zeros(3), np.zeros(3), 0.01, 0.05, 0.002))
@@ -280,8 +286,10 @@ def after_loss(change=lambda state: None, drift=0.0, shake=1.0, image=BLANK, cou
     return vio, out
 
 
-def test_a_filter_lost_in_a_hover_in_the_dark_does_not_start_at_rest():
-    assert all(result.estimate is None for result in after_loss(count=0)[1])
+@pytest.mark.parametrize("speed, rests", [(None, False), (600.0, False), (0.0, True)])
+def test_a_filter_lost_in_the_dark_starts_at_rest_only_where_the_rotors_stand(speed, rests):
+    """After a landing without vision VIO goes on; in a hover it does not."""
+    assert any(result.estimate is not None for result in after_loss(count=0, speed=speed)[1]) is rests
 
 
 @pytest.mark.parametrize("drift, shake, rests", [(0.0, 1.0, True), (0.8, 5.0, False)])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
-from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, RatesThrust, seconds
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, RatesThrust, RotorState, seconds
 from perch_core.vehicle import GRAVITY
 from perch_autopilot import msp
 from perch_autopilot.arming import Arming, Stop
@@ -47,6 +47,7 @@ class Betaflight(Component[BetaflightParameters]):
     command = Input(ControllerCommand, "controller/command")
     poll = Timer(0.01, stamping=True)
     imu = Output(ImuSample, "imu/data_raw")
+    rotors = Output(RotorState, "rotor_state")
 
     def __init__(self, config: BetaflightParameters) -> None:
         """
@@ -148,6 +149,7 @@ class Betaflight(Component[BetaflightParameters]):
         requests = msp.request(msp.RAW_IMU)
         if self._polls % 10 == 0:
             requests += msp.request(_SLOW_REQUESTS[self._polls // 10 % len(_SLOW_REQUESTS)])
+            self._report_standing_rotors(now)
         elif self._arming.in_doubt:
             requests += msp.request(msp.STATUS)
         self._link.request(requests)
@@ -192,6 +194,11 @@ class Betaflight(Component[BetaflightParameters]):
                 self._update_battery(self._battery.voltage)
         except msp.MspError as error:
             self.warn(str(error), min_interval=1.0)
+
+    def _report_standing_rotors(self, now: int) -> None:
+        """Report that the rotors stand while the autopilot answers, is disarmed, and no command has the motors on."""
+        if self._status is not None and not self._status.armed and not self._arming.wanted and now - self._last_answer <= NANOSECONDS:
+            self.rotors(RotorState(now, (0.0,) * 4, (0.0,) * 4))
 
     def _update_battery(self, voltage: float) -> None:
         if self._sticks.battery.reference:

@@ -20,7 +20,7 @@ import numpy as np
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
-from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust, RotorState
 from perch_autopilot import frames
 from perch_autopilot.arming import Stop
 from perch_autopilot.clock import MAX_STEP, ClockOffset, clock_jump
@@ -37,6 +37,7 @@ _HIGHRES_IMU, _IMU_RATE = 105, 200   # its message id; rate that is requested: a
 _FORCED = 21196.0                    # of MAV_CMD_COMPONENT_ARM_DISARM: disarm also in flight
 _LOCAL_FRD, _BODY_FRD = 20, 12       # MAV_FRAME: axes as NED, whose x need not be north; ArduPilot takes no other odometry
 _ODOMETRY_PERIOD = NANOSECONDS // 50  # odometry is sent no more often: at 500 Hz it alone, 240 bytes each, would fill 921600 baud [ns]
+_ROTORS_PERIOD = NANOSECONDS // 10   # between two reports that the rotors stand [ns]
 _IGNORE_ATTITUDE = 128               # of SET_ATTITUDE_TARGET's type_mask: rates and thrust count
 
 
@@ -63,6 +64,7 @@ class Mavlink(Component[MavlinkParameters]):
     odometry = Input(OdometryState, "odometry")
     poll = Timer(0.005, stamping=True)
     imu = Output(ImuSample, "imu/data_raw")
+    rotors = Output(RotorState, "rotor_state")
 
     def __init__(self, config: MavlinkParameters) -> None:
         """
@@ -85,7 +87,7 @@ class Mavlink(Component[MavlinkParameters]):
         self.offboard, self._clock = Offboard(), ClockOffset()
         self._command: RatesThrust | None = None
         self._now: int | None = None         # of the last poll [ns]
-        self._start_time = self._command_time = self._last_heartbeat = self._opened = self._jumps = 0
+        self._start_time = self._command_time = self._last_heartbeat = self._last_rotors = self._opened = self._jumps = 0
         self._corrupt_frames = self._reported_frames = 0
         self._last_odometry: int | None = None  # stamp of the last odometry that was sent [ns]
         self._samples = 0                       # of the IMU that have come since the last heartbeat to the autopilot
@@ -162,6 +164,7 @@ class Mavlink(Component[MavlinkParameters]):
         self._now = now
         for message in self._mavlink.parse_buffer(self._received(now)) or ():
             self._handle_message(message, now)
+        self._report_standing_rotors(now)
         command = self._command if self.offboard.takes_thrust else None
         if command is not None and not 0 <= now - self._command_time <= _HELD:
             command = None
@@ -189,6 +192,13 @@ class Mavlink(Component[MavlinkParameters]):
                     self._send(self._mavlink.param_request_read_encode(self.config.system, 1, name.encode(), -1))
             self._request_imu(now)
             self._diagnose(now)
+
+    def _report_standing_rotors(self, now: int) -> None:
+        """Report that the rotors stand while the autopilot is present and disarmed, and no command has the motors on."""
+        if (self.offboard.alive(now * 1e-9) and not self.offboard.armed and not self.offboard.arming.wanted
+                and not 0 <= now - self._last_rotors < _ROTORS_PERIOD):
+            self._last_rotors = now
+            self.rotors(RotorState(now, (0.0,) * 4, (0.0,) * 4))
 
     def _request_imu(self, now: int) -> None:
         """Request the IMU's rate while less than half of it comes, once a second; an autopilot that restarts forgets it."""

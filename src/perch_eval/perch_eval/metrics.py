@@ -169,7 +169,7 @@ def thrust_history(flight: Flight, vehicle: Vehicle) -> tuple[np.ndarray, np.nda
     for channel in ("rates_thrust_command", "attitude_thrust_command") if len(tc) == 0 else ():
         if flight.values(channel):
             tc, commanded = flight.vectors(channel, lambda c: vehicle.mass * c.thrust if c.armed else 0.0)
-    if len(t) == 0 or len(tc) == 0:
+    if not thrust.any() or len(tc) == 0:  # autopilots report rotors only while they stand
         return np.empty(0), np.empty(0), np.empty(0)
     return t, thrust, np.interp(t, tc, commanded)
 

@@ -11,7 +11,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.component import Component, Diagnostics, Input, Output
 from perch_core.errors import PerchError
-from perch_core.values import EstimatorHealth, ImuSample, InertialState, OdometryState, Transform, rotated
+from perch_core.values import EstimatorHealth, ImuSample, InertialState, OdometryState, RotorState, Transform, rotated
 from perch_perception.estimators import EstimatorConfig
 from perch_perception.imu_intake import ImuIntake
 from perch_perception.sensor_file import imu_noise
@@ -42,6 +42,7 @@ class StateEstimator(Component[EstimatorConfig]):
     vio_state = Input(InertialState, "vio/state")
     vio_odometry = Input(OdometryState, "vio/odometry")
     transform = Input(Transform, "/tf_static")
+    rotors = Input(RotorState, "rotor_state", lazy=True)
     odometry = Output(OdometryState, "odometry")
     status = Output(EstimatorHealth, "estimator/status")
 
@@ -71,6 +72,10 @@ class StateEstimator(Component[EstimatorConfig]):
     def on_vio_odometry(self, odometry: OdometryState) -> None:
         """Keep VIO's odometry for the next IMU sample."""
         self._queue_measurement("vio/odometry", odometry, pose_of)
+
+    def on_rotors(self, rotors: RotorState) -> None:
+        """Take the state of the rotors: where they stand, a vehicle with a quiet IMU rests."""
+        self._estimator.add_rotors(rotors)
 
     def on_imu(self, sample: ImuSample) -> None:
         """Apply the pending VIO measurements, propagate the state to the sample's stamp, and publish it."""

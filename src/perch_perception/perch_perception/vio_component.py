@@ -9,7 +9,7 @@ import numpy as np
 from perch_core import config, so3
 from perch_core.camera_mount import CameraMount
 from perch_core.component import Diagnostics, Input, Output
-from perch_core.values import CameraImage, ImuSample, InertialState, OdometryState, Transform, rotated
+from perch_core.values import CameraImage, ImuSample, InertialState, OdometryState, RotorState, Transform, rotated
 from perch_core.vehicle import load_vehicle
 from perch_perception.camera_component import CameraComponent, extrinsics_parameter, images_parameter
 from perch_perception.images import ImageError, mono_image
@@ -50,6 +50,7 @@ class VioComponent(CameraComponent[VioComponentConfig]):
 
     imu = Input(ImuSample, "imu/data_raw", lazy=True)
     estimate = Input(OdometryState, "odometry", lazy=True)
+    rotors = Input(RotorState, "rotor_state", lazy=True)
     state = Output(InertialState, "vio/state")
     odometry = Output(OdometryState, "vio/odometry")
     debug_image = Output(CameraImage, "vio/debug_image")
@@ -108,6 +109,10 @@ class VioComponent(CameraComponent[VioComponentConfig]):
             self._vio.add_odometry(odometry)
         else:
             self.warn(f"odometry: frame {odometry.frame!r} is not a known fixed frame: ignored", 1.0)
+
+    def on_rotors(self, rotors: RotorState) -> None:
+        """Take the state of the rotors: where they stand, a vehicle with a quiet IMU rests."""
+        self._vio.add_rotors(rotors)
 
     def is_ready(self, image: CameraImage) -> bool:
         """Whether the IMU has passed the image's exposure, or its stamp is too far ahead to wait for."""

@@ -24,7 +24,7 @@ from perch_core.values.perching import MappedPowerline, PowerlineMap, TargetPose
 from perch_core.values.planning import PerchPlanRequest, PowerlinePlanRequest
 from perch_core.values.sensing import CameraImage, CameraModel, ImuSample, Transform
 from perch_core.values.stamps import NANOSECONDS
-from perch_core.values.state import EstimatorHealth, InertialState, OdometryState
+from perch_core.values.state import EstimatorHealth, InertialState, OdometryState, RotorState
 
 _QUOTED_MAX = 60  # characters of a refused text that are quoted
 
@@ -216,6 +216,7 @@ LIMITS: dict[type, dict[str, Any]] = {
         "direction_sigma": Limit(0.0, inf, "rad")},
     PowerlineMap: {"stamp": STAMP, "lines": Each(MappedPowerline, 500)},
     MotorCommand: {"rotor_speed": Limit(0.0, 1e4, "rad/s", (4,))},
+    RotorState: {"speed": Limit(-1e4, 1e4, "rad/s", (4,)), "thrust": Limit(-1e3, 1e3, "N", (4,))},
     RatesThrust: {"w_B": ANGULAR_VELOCITY, "thrust": _SPECIFIC_THRUST},
     AttitudeThrust: {"q_WB": Unit(), "w_B": ANGULAR_VELOCITY, "thrust": _SPECIFIC_THRUST},
     ControllerCommand: {"command": Limit(0, 5)},

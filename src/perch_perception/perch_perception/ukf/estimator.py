@@ -13,14 +13,14 @@ import math
 import numpy as np
 from scipy.linalg import block_diag
 
-from perch_core.values import ImuSample
+from perch_core.values import ImuSample, RotorState
 from perch_perception.ukf import kernels, start
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.ukf.measurement import Estimate, Health, Status, VioOutcome, VioPose
 from perch_perception.ukf.rest import after_rest, after_stop
-from perch_perception.ukf.stillness import WINDOW, is_at_rest, leans, moves, window
+from perch_perception.ukf.stillness import WINDOW, is_at_rest, rotors_stand, window
 from perch_perception.ukf.unscented import GATES, Belief, CovarianceError, Innovation, UnscentedTransform
 
 _HISTORY = 0.5  # IMU kept for replay: VIO is late by 0.04 s, by 0.08 s in the campaign on robustness [s]
@@ -36,8 +36,8 @@ _MAX_WAITING = 20  # poses ahead of the IMU that are kept
 class Estimator:
     """Estimator that fuses IMU samples and delayed VIO poses, and owns its state.
 
-    Call `add_imu` and `add_vio` in order of arrival, and read `estimate` and `status`. The same inputs give bit-identical
-    outputs.
+    Call `add_imu`, `add_vio` and `add_rotors` in order of arrival, and read `estimate` and `status`. The same inputs give
+    bit-identical outputs.
     """
 
     def __init__(self, config: UkfConfig = UkfConfig()) -> None:
@@ -46,7 +46,8 @@ class Estimator:
         self._imu = ImuBuffer(config.imu, _HISTORY)
         self._base: Belief | None = None  # at the stamp of the last applied pose, or of rest
         self._newest_vio_stamp = self._applied = 0   # newest stamp of any pose, and of an applied one [ns]
-        self._resting = self._has_moved = False  # the base is one of rest; the vehicle has moved since the first pose
+        self._resting = False  # the base is one of rest
+        self._rotors: RotorState | None = None  # the newest
         self._live: Belief | None = None  # covariance up to a few steps ago
         self._anchors: list[Belief] = []  # where a replay can begin: the base and, without VIO for long, later beliefs
         self._x = np.zeros(at.NOMINAL_SIZE)  # nominal state now
@@ -94,6 +95,10 @@ class Estimator:
         if outcome not in (VioOutcome.APPLIED, VioOutcome.WAITING):
             self._message = f"VIO pose at {pose.stamp} ns {outcome.value}"
         return outcome
+
+    def add_rotors(self, rotors: RotorState) -> None:
+        """Store the state of the rotors: a vehicle with a quiet IMU rests where they stand."""
+        self._rotors = rotors
 
     @property
     def estimate(self) -> Estimate | None:
@@ -212,18 +217,17 @@ class Estimator:
     def _rest(self) -> None:
         """Without VIO poses, apply rest up to the middle of the window where the vehicle rests; a departure may just have begun.
 
-        Skipped while VIO poses arrive: VIO applies rest itself, or measures the pose at rest. A vehicle that has moved may hover as
-        quietly as it would rest: then only a lean shows rest.
+        Skipped while VIO poses arrive: VIO applies rest itself, or measures the pose at rest. A vehicle may hover as quietly
+        as it would rest: a rest begins only where the rotors stand.
         """
         now, config = self._imu.newest.stamp, self.config
         if self._base is None or self._live is None:
             return
-        self._has_moved |= moves(self._live.x[at.VELOCITY], float(np.sqrt(np.diag(self._live.P)[at.D_VELOCITY].max())))
         belief, middle = self._base, now - round(0.5e9 * WINDOW)
         if belief.stamp >= middle or now - max(self._newest_vio_stamp, belief.stamp) < round(1e9 * config.coasting_after):
             return
         steps = window(self._imu, now)
-        may_rest = self._resting or not self._has_moved or leans(steps)
+        may_rest = self._resting or rotors_stand(self._rotors, now)
         if not may_rest or not is_at_rest(steps, belief.x[10:16], np.diag(self._live.P)[9:15]):
             self._resting = False
             return

@@ -9,15 +9,16 @@ and these constants are the gyro's bias and, with the accelerometer's bias, g in
 from the uncertainty of the biases and from the scatter of the readings. Where no filter has estimated the biases, the largest
 turn-on biases are assumed.
 
-The test works in any attitude and requires neither images nor the controller's state. It cannot distinguish constant motion from
-rest, nor a hover whose vibration is within the sensor file's noise. After a motion the caller therefore requires that the velocity
-may be zero (`ukf.rest`, `vio.rest`), and evidence beyond a quiet IMU, e.g. a static image or a lean (docs/estimation.md).
+The test works in any attitude and requires no images. It cannot distinguish constant motion from rest, nor a hover whose vibration is
+within the sensor file's noise. After a motion the caller therefore requires that the velocity may be zero (`ukf.rest`, `vio.rest`),
+and evidence beyond a quiet IMU: a static image, or rotors that stand (docs/estimation.md).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from perch_core.values import RotorState
 from perch_core.vehicle import GRAVITY
 from perch_perception.ukf.imu_buffer import ImuBuffer
 from perch_perception.ukf.unscented import ACCEL, ACCEL_VARIANCE, DT, GYRO, GYRO_VARIANCE
@@ -30,8 +31,8 @@ _MIN_SAMPLES = 10
 _MIN_COVERAGE = 0.9   # share of the window that the samples must span
 _LAST_PART = 4        # part of the window, its last, that must look like rest as well: a departure has just begun
 _MEAN_GATE = 6.0      # sigma up to which a mean counts as zero
-_MOVING = 0.1         # speed of a vehicle that certainly moves, if it is known that well [m/s]
-_HOVER_COSINE = 0.866  # of 30 deg, the largest tilt of a vehicle that its rotors hold still in the wind
+_STANDING = 10.0      # speed below which a rotor stands: armed ones idle at 100 rad/s and more [rad/s]
+_ROTORS_VALID = 500_000_000  # age up to which a state of the rotors counts [ns]
 
 
 def energy(steps: np.ndarray) -> float:
@@ -66,18 +67,11 @@ def is_at_rest(steps: np.ndarray, biases: np.ndarray | None = None, variance: np
     return bool((_excess_means(latest, biases, known) < _MEAN_GATE * spread / np.sqrt(len(latest))).all())
 
 
-def leans(steps: np.ndarray) -> bool:
-    """Whether the mean specific force over IMU steps (m, 9) is farther off b3 than rotors can hold a vehicle still.
-
-    Their thrust is along b3: a vehicle that is at rest with another direction upwards is held by a surface or a wire.
-    """
-    f = steps[:, ACCEL].mean(axis=0)
-    return bool(f[2] < _HOVER_COSINE * np.linalg.norm(f))
-
-
-def moves(v_WB: np.ndarray, sigma: float) -> bool:
-    """Whether a velocity (3,), known to 1 sigma along each axis, certainly exceeds rest: by `_MOVING`, and by six sigma."""
-    return float(np.linalg.norm(v_WB)) > max(_MOVING, 6.0 * sigma)
+def rotors_stand(rotors: RotorState | None, now: int) -> bool | None:
+    """Whether the rotors stand by their newest state, at a stamp `now` [ns]; None: there is no state, or an old one."""
+    if rotors is None or abs(now - rotors.stamp) > _ROTORS_VALID:
+        return None
+    return max(map(abs, rotors.speed)) < _STANDING
 
 
 def _excess_means(steps: np.ndarray, biases: np.ndarray | None, known: np.ndarray) -> np.ndarray:

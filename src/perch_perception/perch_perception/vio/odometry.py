@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 from perch_core.camera import Camera
 from perch_core.camera_mount import CameraMount
-from perch_core.values import ImuSample, OdometryState
+from perch_core.values import ImuSample, OdometryState, RotorState
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome, without_gaps
 from perch_perception.ukf.odometry import pose_of
-from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS, energy, is_at_rest, leans, moves, window
+from perch_perception.ukf.stillness import MAX_ACCEL_BIAS, MAX_GYRO_BIAS, energy, is_at_rest, rotors_stand, window
 from perch_perception.ukf.unscented import GYRO
 from perch_perception.vio import ekf, ground, motion_start, rest, start
 from perch_perception.vio import state as at
@@ -36,7 +36,6 @@ _MAX_BLIND_NO_TRACKS = 0.15  # longest time without a visual update where nothin
 _MAX_BLIND = 0.5  # the same while features are tracked [s]
 _MAX_BLIND_TAKE_OFF = 1.0  # the same at a take-off, from rest on [s]
 _MAX_TAKE_OFF_SIGMA = 0.05  # largest 1 sigma of the velocity in a blind take-off [m/s]
-_MAX_STANDING_SIGMA = 0.02  # largest 1 sigma of the height of a vehicle that is known to stand on the floor [m]
 _UNSEEN_SPEED = 1.0  # of a vehicle that left its place while there were no images [m/s]
 _DIVERGENCE_FRAMES = 15  # frames over which observations that are refused and used are counted
 _MAX_STAMP_LEAD = 500_000_000  # an image this far ahead of the IMU cannot be right [ns]
@@ -65,13 +64,13 @@ class VisualInertialOdometry:
         self.restarts = 0
         self._imu = ImuBuffer(config.imu, 2.0 + motion_start.DURATION)
         self._last_pose = LastPose(start.configured_pose(p_WB, yaw))
-        self._floor, self._standing_height = floor, float(p_WB[2])  # in W
+        self._floor = floor
         self._views: deque[tuple[int, Features]] = deque()  # (exposure, features) at rest, not passed by the filter
         self._recent_views = RecentViews()
         self._gyro_bias: np.ndarray | None = None  # of the last filter whose biases may be true
         self._odometry: deque[OdometryState] | None = deque(maxlen=_KEPT_ODOMETRY)  # of the estimator; None from the first start on
-        self._odometry_rests = False  # by the newest odometry, while it is used
-        self._at_rest, self._has_moved = False, True  # has moved: since the last rest
+        self._rotors: RotorState | None = None  # the newest
+        self._at_rest = False
         self._noise_factor = 1.0  # variance of the IMU at rest over that of the sensor's noise, as last measured
         self._at_configured_start = True  # the vehicle has not left the configured start
         self._last_visual_update: int | None = None  # when vision last changed the state; None: not since the last rest
@@ -142,6 +141,15 @@ class VisualInertialOdometry:
         """Store odometry of the estimator, which a first start in flight continues; later odometry derives from this one."""
         if self._odometry is not None:
             self._odometry.append(odometry)
+
+    def add_rotors(self, rotors: RotorState) -> None:
+        """Store the state of the rotors: a vehicle with a quiet IMU rests where they stand."""
+        self._rotors = rotors
+
+    @property
+    def _rotors_stand(self) -> bool | None:
+        """Whether the rotors stand; None: not known."""
+        return None if self._imu.last is None else rotors_stand(self._rotors, self._imu.last.stamp)
 
     def add_image(self, stamp: int, image: np.ndarray) -> VioResult:
         """Process a frame.
@@ -243,27 +251,27 @@ class VisualInertialOdometry:
         """Whether the last IMU steps (m, 9) and images are those of a vehicle at rest.
 
         With odometry, or after a loss in motion, it may hover, where for moments either looks like rest: the IMU must be quiet and
-        the image static for long, or, without an image, the vehicle lean or be known to rest by the odometry. The biases of an
-        earlier filter do not count: they may be why it was lost. Odometry that cannot be used leaves the configured start. A vehicle
-        that rested before its camera was silent or replaced may have left: what the image shows, it must show for long.
+        the image static for long, or, without an image, the rotors stand. The biases of an earlier filter do not count: they may be
+        why it was lost. Odometry that cannot be used leaves the configured start. A vehicle that rested before its camera was silent
+        or replaced may have left: what the image shows, it must show for long. A vehicle that has not moved needs no evidence without
+        an image, unless its rotors turn.
         """
         for_long, moving = self._recent_views.is_static(STATIC_DURATION), self._last_pose.known_at is not None
+        stand = self._rotors_stand
+        unseen = stand or (stand is None and not moving)
         if moving or self._odometry:
-            unseen = for_long is None and (not moving or self._odometry_rests or leans(steps))
-            return bool(for_long or unseen) and is_at_rest(steps)
+            return bool(unseen if for_long is None else for_long) and is_at_rest(steps)
         static = self._recent_views.is_static() if self._at_configured_start else for_long
-        return static is not False and is_at_rest(steps, image_is_static=bool(for_long))
+        return bool(unseen if static is None else static) and is_at_rest(steps, image_is_static=bool(for_long))
 
     def _take_odometry(self, exposure: int) -> None:
         """Make the newest odometry before an exposure the known pose."""
         odometry = next((o for o in reversed(self._odometry or ()) if self._imu.oldest <= o.stamp < exposure), None)
-        self._odometry_rests = False
         if odometry is None:
             return
         pose = pose_of(odometry)
         if pose.problem() is None:
             self._last_pose.pose, self._at_configured_start = start.odometry_pose(pose), False
-            self._odometry_rests = start.is_known_to_rest(pose, self.config.imu)
             self._last_pose.known_at = pose.stamp, float(np.linalg.norm(odometry.v_B))
             self._last_pose.begin_rotation(self._motion_start.gyro_bias)
             self._last_pose.rotate(self._imu.run(pose.stamp, exposure))
@@ -272,7 +280,7 @@ class VisualInertialOdometry:
         self._last_pose.propagate_position(state, self._imu)
         self.filter = Msckf(self.config, state, self.mount.camera.fx)
         self._last_update = state.stamp
-        self._odometry, self._odometry_rests, self._has_moved = None, False, True
+        self._odometry = None
         self._observation_counts.clear()
 
     # -- afterwards --------------------------------------------------------------------------------------------------
@@ -286,7 +294,6 @@ class VisualInertialOdometry:
         self._at_rest = False
         filter.propagate(self._imu.run(filter.state.stamp, exposure), exposure)
         report = filter.add_frame(self._frame, features.ids, self._observe(features))
-        self._has_moved |= bool(report.used) or moves(filter.state.v_WB, velocity_sigma(filter.state))
         if report.used:
             self._last_visual_update, self._at_configured_start = exposure, False
         return self._check_divergence(exposure, features, report)
@@ -295,8 +302,8 @@ class VisualInertialOdometry:
         """Whether the vehicle rests: the IMU is quiet, nothing moves in the image, and the filter's velocity may be zero.
 
         False until `_MAX_BLIND_NO_TRACKS` after a visual update: a very quiet hover looks like rest. A rest therefore begins only with
-        evidence beyond the IMU: an image that is static for long, a lean, the height of standing on the floor, or no motion since the
-        last rest. Where IMU samples are missing, a vehicle that rested before rests still if the images since have not moved.
+        evidence beyond the IMU: an image that is static for long, or rotors that stand. Where IMU samples are missing, a vehicle that
+        rested before rests still if the images since have not moved.
         """
         if self._last_visual_update is not None and exposure - self._last_visual_update < round(1e9 * _MAX_BLIND_NO_TRACKS):
             return False
@@ -304,16 +311,10 @@ class VisualInertialOdometry:
         quiet, for_long = self._recent_views.is_static(), bool(self._recent_views.is_static(STATIC_DURATION))
         if self._at_rest and quiet and len(without_gaps(steps)) < len(steps):
             return for_long
-        evidence = for_long or leans(steps) or self._is_on_floor(state) or self._is_leaving(exposure) or not self._has_moved
+        evidence = for_long or self._rotors_stand
         if not self._at_rest and not (evidence and rest.velocity_may_be_zero(state)):
             return False
         return quiet is not False and is_at_rest(steps, *_biases(state), image_is_static=bool(quiet) and (self._at_rest or for_long))
-
-    def _is_on_floor(self, state: at.State) -> bool:
-        """Whether the height is that of standing on the level ground, by three sigma of a height that is known well."""
-        sigma = float(np.sqrt(np.abs(state.P[at.POSITION, at.POSITION][2, 2])))
-        return (self._floor is not None and sigma < _MAX_STANDING_SIGMA
-                and abs(float(state.p_WB[2]) - self._standing_height) < 3.0 * sigma)
 
     def _is_leaving(self, exposure: int) -> bool:
         """Whether the velocity is still known from the last rest: no visual update since, which was a moment ago."""
@@ -331,7 +332,7 @@ class VisualInertialOdometry:
         if not self._at_rest:
             filter.propagate(self._imu.run(state.stamp, until), until)
             rest.stop(filter)
-            self._at_rest, self._has_moved, self._last_visual_update = True, False, None
+            self._at_rest, self._last_visual_update = True, None
             self._views.clear()
         steps, latest = self._imu.run(state.stamp, until), window(self._imu, exposure)
         if len(without_gaps(latest)) == len(latest):

@@ -9,9 +9,8 @@ from perch_core import so3
 from perch_core.camera_mount import CameraMount
 from perch_core.vehicle import GRAVITY
 
-from perch_perception.ukf.config import ImuNoise
 from perch_perception.ukf.measurement import VioPose
-from perch_perception.ukf.stillness import REST_VELOCITY, WINDOW, energy
+from perch_perception.ukf.stillness import REST_VELOCITY, energy
 from perch_perception.ukf.unscented import ACCEL, DT, GYRO
 from perch_perception.vio import ekf
 from perch_perception.vio import state as at
@@ -62,16 +61,6 @@ def configured_pose(p_WB: np.ndarray, yaw: float) -> KnownPose:
 def odometry_pose(pose: VioPose) -> KnownPose:
     """Return the pose in the odometry of a running estimator; its covariance is made regular."""
     return KnownPose(pose.p_WB, so3.quat_to_matrix(pose.q_WB), pose.covariance[POSE_ROWS] + np.diag(np.square(CONFIGURED_POSE_SIGMA)))
-
-
-def is_known_to_rest(pose: VioPose, imu: ImuNoise) -> bool:
-    """Whether the velocity of odometry is near zero, and better known than the IMU alone could keep it over `WINDOW`.
-
-    An estimator that has neither VIO nor motion capture knows it so well only where it rests itself.
-    """
-    sigma, P = imu.accel_noise_density * np.sqrt(WINDOW), pose.velocity_covariance
-    return (pose.v_B is not None and P is not None and bool(np.diag(P).max() < sigma**2)
-            and float(np.linalg.norm(pose.v_B)) < 3.0 * sigma)
 
 
 def positive(covariance: np.ndarray) -> np.ndarray:
