@@ -118,11 +118,13 @@ class Stranger:
         return future.result()
 
 
-@pytest.fixture
-def stranger(graph: dict[str, Running]) -> Iterator[Stranger]:
-    """A process beside the nodes."""
-    with watching() as (node, executor):
-        yield Stranger(node, executor)
+@pytest.fixture(scope="module")
+def stranger(free: dict[str, Running]) -> Iterator[Stranger]:
+    """Beside the nodes; the graph discovers it once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", free["estimator"].domain)
+        with watching() as (node, executor):
+            yield Stranger(node, executor)
 
 
 def test_what_is_wrong_is_said(stranger, graph):
@@ -167,3 +169,4 @@ def test_every_request_is_answered(name, stranger, graph):
             assert answer.success or (answer.error_code and answer.message), wrong
     assert asked
     assert stranger.ask(kind, name, request).success
+    stranger.go_on()

@@ -27,8 +27,8 @@ def killed(flight: Rig, name: str):
     yield lambda: flight.said(f"lockstep: {name} has reconnected") > back
 
 
-def test_in_lockstep_they_take_their_places_and_it_perches(tmp_path):
-    with rig(tmp_path, ("vio_model", "estimator", "mission")) as flight:
+def test_in_lockstep_they_take_their_places_hanging_ones_are_named_with_what_they_owe_and_it_perches(tmp_path):
+    with rig(tmp_path, ("vio_model", "estimator", "mission", "target_localizer")) as flight:
         def acts():
             yield "take_off"
             yield from killed(flight, "vio_model")
@@ -41,8 +41,19 @@ def test_in_lockstep_they_take_their_places_and_it_perches(tmp_path):
         above = replace(flight.scenario, mission=replace(flight.scenario.mission, takeoff_height=3.0), time_limit=200.0)
         lost = flight.fly(acts(), above)  # a climb that takes a while
         assert str(lost) in ("the mission was restarted: its goal was dropped", "the mission has ended: its goal was dropped"), lost
-        result = flight.fly(iter(()))
-        assert result.outcome == "perched", result.message
+
+        def hangs():
+            for name, owed in (("estimator", "its answer to the present step"), ("target_localizer", "its results")):
+                yield "searching"
+                line = f"lockstep: for .* waiting for .*{name}: {owed}"
+                before = flight.said(line)
+                flight.signal(name, signal.SIGSTOP)
+                yield lambda: f"{name}: {owed}" in flight.pilot.waiting_for
+                yield lambda: flight.said(line) > before
+                flight.signal(name, signal.SIGCONT)
+
+        result = flight.fly(hangs())
+        assert getattr(result, "outcome", "") == "perched", result
 
 
 def test_a_restarted_controller_leaves_the_motors_off_and_the_mission_says_so(tmp_path):
@@ -54,20 +65,6 @@ def test_a_restarted_controller_leaves_the_motors_off_and_the_mission_says_so(tm
         result = flight.fly(acts())
         assert result.outcome == "tracking_lost" and "disarmed" in result.message
         flight.until(lambda: flight.on_floor() and flight.controller == ControllerStatus.DISARMED, "it is not on the floor with its motors off")
-
-
-def test_a_hanging_node_is_named_with_what_it_owes_and_goes_on(tmp_path):
-    with rig(tmp_path, ("estimator", "target_localizer")) as flight:
-        def acts():
-            for name, owed in (("estimator", "its answer to the present step"), ("target_localizer", "its results")):
-                yield "searching"
-                flight.signal(name, signal.SIGSTOP)
-                yield lambda: f"{name}: {owed}" in flight.pilot.waiting_for
-                yield lambda: flight.said(f"lockstep: for .* waiting for .*{name}: {owed}") > 0
-                flight.signal(name, signal.SIGCONT)
-
-        result = flight.fly(acts())
-        assert getattr(result, "outcome", "") == "perched", result
 
 
 def test_a_node_that_was_dropped_as_it_hung_comes_back_and_answers_to_its_goal(tmp_path):

@@ -134,10 +134,13 @@ def test_vehicle_files_are_what_identification_writes(vehicle, tmp_path, monkeyp
 
 
 def command_line(running) -> Cli:
-    """Of a firmware in the loop: its time is that of the packets, and it waits for a pause before it takes a line."""
-    def receive(_: float) -> bytes:
-        running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
-        return running.receive(0.001)
+    """Of a firmware in the loop: it opens it after a pause of its own time, which is that of the packets."""
+    def receive(silence: float) -> bytes:
+        if data := running.receive(silence):
+            return data
+        for _ in range(60):  # longer than the pause; and on a busy machine its turn to write comes, too
+            running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
+        return running.receive(silence)
 
     return Cli(running.send, receive)
 
@@ -163,8 +166,10 @@ def test_its_time_is_that_of_the_packets_and_no_pause_counts():
         for _ in range(500):
             running.step(STILL, GRAVITY, LEVEL, (1500, 1500, 1000, 1500))
         time.sleep(2.5)  # more than seconds, which are cut, and the tolerance hide
-        uptime = re.search(r"System Uptime: (\d+) seconds", command_line(running).query("status"))
-        assert int(uptime[1]) == pytest.approx(60.0 + running.time, abs=1.0)  # it begins with 60
+        cli = command_line(running)
+        asked = running.time
+        uptime = re.search(r"System Uptime: (\d+) seconds", cli.query("status"))
+        assert int(uptime[1]) == pytest.approx(60.0 + asked, abs=1.0)  # it begins with 60
     finally:
         running.close()
 
@@ -304,7 +309,7 @@ def test_what_flies_goes_on_when_node_or_supervisor_are_started_anew(vehicle):
     try:
         poll(False)
         until(lambda: min(vehicle.motors) > 0.6, often=poll)
-        flown(1.0)                                                                # its state is known
+        until(lambda: got["diagnostics"] and got["diagnostics"][-1].values.get("armed"), often=poll)  # its state is known
         node._link.process.kill()
         assert flown(1.5) > 0.6
         assert "the process that holds the link has ended: it is restarted" in {line.text for line in got["log"]}
@@ -327,17 +332,19 @@ def test_preflight_sees_whether_the_pilot_takes_over(vehicle, switched):
     listener = object.__new__(GraphListener)
     listener.values, listener._namespace = {channel: [] for channel in CHANNELS}, ""
 
+    def work():
+        node.on_rates_thrust(order := RatesThrust(0, True, STILL, 9.81))
+        node.on_poll(time.monotonic_ns())
+        listener.values["rates_thrust_command"].append((time.monotonic(), order))
+        told = listener.values["/diagnostics"]
+        told += [(time.monotonic(), said) for said in got["diagnostics"][len(told):]]
+        if switched and told and told[-1][1].values.get("armed"):
+            vehicle.radio[6], vehicle.radio[4] = OFF, OFF
+
     def spin_for(duration):
-        last = time.monotonic() + duration
-        while time.monotonic() < last:
-            node.on_rates_thrust(order := RatesThrust(0, True, STILL, 9.81))
-            node.on_poll(time.monotonic_ns())
-            listener.values["rates_thrust_command"].append((time.monotonic(), order))
-            told = listener.values["/diagnostics"]
-            told += [(time.monotonic(), said) for said in got["diagnostics"][len(told):]]
-            if switched and told and told[-1][1].values.get("armed"):
-                vehicle.radio[6], vehicle.radio[4] = OFF, OFF
-            time.sleep(0.005)
+        """At first, until the node has said that the motors turn, however late that comes."""
+        end, told = time.monotonic() + duration, listener.values["/diagnostics"]
+        until(lambda: time.monotonic() > end and any(said.values.get("armed") for _, said in told), often=work)
 
     listener.spin_for = spin_for
     try:
@@ -362,21 +369,22 @@ def test_why_it_does_not_arm_is_said(vehicle):
         node.close()
 
 
+def answered(running, *requests: bytes) -> list[msp.Frame]:
+    """Answers of a firmware in the loop over MSP. It gives them between cycles: none passes meanwhile, however late they come."""
+    parser, frames, last = msp.Parser(), [], time.monotonic() + 120.0
+    running.send(b"".join(requests))
+    while len(frames) < len(requests):
+        assert time.monotonic() < last, "it does not answer"
+        frames += parser.feed(running.receive(1.0))
+    return frames
+
+
 def refusals(running, radio=(1500, 1500, 1000, 1500, OFF), orders=(), cycles=100) -> tuple[str, ...]:
-    """Why a firmware in the loop does not arm after some cycles with a radio, pulse widths [us], and orders over MSP."""
-    for order in orders:
-        running.send(msp.request(*order))
+    """Why a firmware in the loop does not arm some cycles after orders over MSP, with a radio, pulse widths [us]."""
+    assert not any(frame.refused for frame in answered(running, *(msp.request(*order) for order in orders)))
     for _ in range(cycles):
         running.step(STILL, GRAVITY, LEVEL, radio)
-    running.receive(0.001)
-    running.send(msp.request(msp.STATUS))
-    parser = msp.Parser()
-    for _ in range(1000):
-        running.step(STILL, GRAVITY, LEVEL, radio)
-        for frame in parser.feed(running.receive(0.001)):
-            if frame.command == msp.STATUS:
-                return msp.status(frame).refusals
-    raise AssertionError("no status comes")
+    return msp.status(*answered(running, msp.request(msp.STATUS))).refusals
 
 
 def test_reasons_not_to_arm_that_can_be_provoked_are_named():
@@ -404,7 +412,7 @@ def test_reasons_not_to_arm_that_can_be_provoked_are_named():
 
 def test_samples_and_attitude_come_in_the_axes_that_are_read():
     """Angular velocity in FLU; roll, pitch, heading of FRD in NED, against scipy's."""
-    running, parser = started(lambda: Sitl(load_configuration("betaflight"))), msp.Parser()
+    running = started(lambda: Sitl(load_configuration("betaflight")))
     rng, turned = np.random.default_rng(2), Rotation.from_euler("x", 180.0, degrees=True)
     try:
         for _ in range(300):
@@ -412,18 +420,12 @@ def test_samples_and_attitude_come_in_the_axes_that_are_read():
         for _ in range(6):
             R = Rotation.from_euler("ZYX", rng.uniform((-170, -70, -170), (170, 70, 170)), degrees=True)
             gyro, force, q = rng.uniform(-2.0, 2.0, 3), R.inv().apply(GRAVITY), R.as_quat()[[3, 0, 1, 2]]
-            got: dict = {}
             for _ in range(500):
                 running.step(gyro, force, q, (1500, 1500, 1000, 1500))
-            running.send(msp.request(msp.RAW_IMU) + msp.request(msp.ATTITUDE))
-            for _ in range(1000):
-                running.step(gyro, force, q, (1500, 1500, 1000, 1500))
-                got |= {frame.command: frame for frame in parser.feed(running.receive(0.001))}
-                if len(got) == 2:
-                    break
-            felt, rate = msp.inertial(got[msp.RAW_IMU], 256.0)
+            inertial, attitude = answered(running, msp.request(msp.RAW_IMU), msp.request(msp.ATTITUDE))
+            felt, rate = msp.inertial(inertial, 256.0)
             assert rate == pytest.approx(gyro, abs=0.01) and felt @ force > 0.9 * GRAVITY[2]**2  # its accelerometer is filtered
-            roll, pitch, heading = np.degrees(msp.attitude(got[msp.ATTITUDE]))
+            roll, pitch, heading = np.degrees(msp.attitude(attitude))
             true = (turned * R * turned.inv()).as_euler("ZYX", degrees=True)  # heading, pitch, roll; whole degrees of heading are told
             assert (roll, pitch) == pytest.approx(true[:0:-1], abs=0.2) and abs((heading - true[0] + 180.0) % 360.0 - 180.0) < 1.1
     finally:
@@ -544,9 +546,8 @@ def test_a_receiver_by_msp_alone_levels_and_descends_when_the_wire_is_cut(monkey
 
     def bench(loop, switch, _):
         for _ in range(500):
-            loop.sitl.send(msp.channels((*CENTRED, switch, OFF)))
+            answered(loop.sitl, msp.channels((*CENTRED, switch, OFF)))
             motors = loop.sitl.step(STILL, GRAVITY, LEVEL, CENTRED)
-            loop.sitl.receive(1.0)
             if min(motors) > 0.02 if switch == ON else max(motors) == 0.0:
                 return
         raise AssertionError(loop.sitl.status())
