@@ -87,7 +87,7 @@ def test_a_cancelled_perch_leaves_by_a_way_out_and_ends_in_a_hover(before):
 
 def test_cancelled_too_late_the_perch_goes_on():
     flown = fly_cancelled("surface_90", 1, 0.1)
-    assert flown.end == "attached" and flown.message.startswith("cancelled too late: perched (")
+    assert flown.end == "attached" and flown.perched and flown.message.startswith("cancelled too late: perched (")
 
 
 @pytest.mark.parametrize("left", [0.8, 0.4, 0.2])
