@@ -55,8 +55,8 @@ def test_errors_of_few_flights_are_not_those_of_all(effort, perches, found):
 def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch):
     def rows(effort, name, jobs, work, good):
         if name == "aborted":
-            return [{"scenario": s, "seed": n, "before": t, "planned": True, "end": "never cancelled", "message": "", "rate": 1.0, "margin": 0.1,
-                     "distance": 1.0, "settled": 0.1} for s, n, t in jobs]
+            return [{"scenario": s, "seed": n, "before": t, "planned": True, "end": "never cancelled", "perched": False, "message": "", "rate": 1.0,
+                     "margin": 0.1, "distance": 1.0, "settled": 0.1} for s, n, t in jobs]
         return [{"name": name, "seed": seed, "refused": "" if seed == 1 else "thrust", "instants": [(1.0, "")] if seed == 1 else []} for name, seed in jobs]
 
     monkeypatch.setattr(ways_out, "cached_figures", rows)
@@ -68,14 +68,20 @@ def test_ways_out_of_the_one_plan_that_there_is_are_not_all(effort, monkeypatch)
     (0.35, "cancelled too late: perched", "fails")])
 def test_a_cancelled_flight_is_attached_for_good_only_where_it_was_too_late(effort, monkeypatch, before, message, verdict):
     def rows(effort, name, jobs, work, good):
-        flown = [{"scenario": s, "seed": n, "before": before, "planned": False, "end": "attached", "message": message, "rate": 1.0,
-                  "margin": 0.1, "distance": 1.0, "settled": 0.1} for s, n, _ in jobs] if name == "aborted" else []
+        perched = message == "cancelled too late: perched"
+        flown = [{"scenario": s, "seed": n, "before": before, "planned": False, "end": "attached", "perched": perched, "message": message,
+                  "rate": 1.0, "margin": 0.1, "distance": 1.0, "settled": 0.1} for s, n, _ in jobs] if name == "aborted" else []
         assert all(good(r) == (verdict == "holds") for r in flown)
         return flown
 
     monkeypatch.setattr(ways_out, "cached_figures", rows)
     found = verdicts(ways_out.sections(effort)[0])
     assert {found[f"{name}: cancelled on the way"] for name in ways_out.CANCELLED_FLIGHTS} == {verdict}
+
+
+def test_a_perch_after_a_late_cancel_is_known_by_the_result_not_by_its_words():
+    flown = {"end": "attached", "before": 0.1, "scenario": "surface_90", "perched": True, "message": "reworded"}
+    assert ways_out._too_late(flown) and not ways_out._too_late(flown | {"perched": False, "message": "cancelled too late"})
 
 
 def test_refusals_that_differ_in_the_interval_found_are_one_line(effort, monkeypatch):

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from perch_control.mission import AdhesionMonitor, Goal, MissionSettings, Plan, Refusal, State, Target
+from perch_control.mission import (
+    AdhesionMonitor, ControllerState, Goal, Inputs, MissionSettings, Phase, Plan, PowerlineMission, Refusal, State, Target)
 from perch_control.mission.running_plan import RunningPlan
 from perch_control.mission.requests import flown_order
 from perch_control.smooth_position import START_BEFORE_CONTACT
@@ -163,6 +164,15 @@ def test_an_answer_that_comes_too_late_is_not_used():
     plan = running()
     query = plan.query(START + 0.1, AT_REST, None, GOAL)
     assert plan.answered(answer(query.start_time, 1.0), query.start_time + 0.01) == (None, None)
+
+
+def test_a_goal_that_is_cancelled_on_the_ground_says_so_even_where_no_way_out_of_its_plan_is_left():
+    machine = PowerlineMission(SETTINGS)
+    machine.start(GOAL, START)
+    machine.phase, machine._running = Phase.TRACKING, running()
+    time = machine._running.plan.end
+    outputs = machine.tick(Inputs(time, AT_REST, True, ControllerState.DISARMED, "", 0, None, np.zeros((0, 3)), cancel=True))
+    assert machine.message == outputs.outcome.message == "cancelled on the ground"
 
 
 def tilted(angle: float) -> np.ndarray:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from oracles import renderer as plain
 from perch_sim.rendering import kernels
 from perch_sim.rendering.grid import sample_weights
 
@@ -29,7 +30,7 @@ def test_uniform_cells(world, supersampling):
     weights = sample_weights(supersampling)
     ours, theirs = np.empty((2, 2, 40, weights.shape[1]), np.float32)
     kernels.uniform_samples(M, affine[:40], corners, cells, face, weights, *ours)
-    kernels.uniform_samples_numpy(M, affine[:40], corners, cells, face, weights, *theirs)
+    plain.uniform_samples(M, affine[:40], corners, cells, face, weights, *theirs)
     np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-2)  # [texel]; the sums are grouped differently
 
 
@@ -41,7 +42,7 @@ def test_cells_in_which_faces_meet(world, half):
     ours, theirs = (np.full((3, 50, weights.shape[1]), 1e-6, np.float32) for _ in range(2))
     for face in range(FACES):
         rows = np.flatnonzero(rng.random(50) < 0.7)
-        for draw, out in ((kernels.nearer_samples, ours), (kernels.nearer_samples_numpy, theirs)):
+        for draw, out in ((kernels.nearer_samples, ours), (plain.nearer_samples, theirs)):
             draw(M[face], half, affine[rows], corners, cells, rows, weights, *out)
     agree = np.isclose(ours, theirs, rtol=1e-4, atol=1e-2).all(axis=0)
     assert agree.mean() > 0.999  # the odd sample lies on an edge
@@ -57,7 +58,7 @@ def test_classified_cells(world):
     half[[1, 3]] = 0.2
     crossed = rng.random((2, len(corner_nodes))) < 0.2
     found = []
-    for draw in (kernels.classify, kernels.classify_numpy):
+    for draw in (kernels.classify, plain.classify):
         out = np.empty(len(corner_nodes), np.int64), np.empty(len(corner_nodes), bool), crossed.copy()
         draw(M, half, bounded, nodes, corner_nodes, *out)
         found.append(out)
@@ -74,7 +75,7 @@ def test_levels_of_the_atlas(world):
     table, levels = rng.normal(size=(FACES, 9, 4)).astype(np.float32), np.array([9, 4, 9, 1, 9])
     angle, texel = np.full(CELLS, 0.004, np.float32), rng.uniform(0.0005, 0.02, FACES)
     ours, theirs = np.empty((2, 40, 4), np.float32)
-    for draw, out in ((kernels.affine_of_cells, ours), (kernels.affine_of_cells_numpy, theirs)):
+    for draw, out in ((kernels.affine_of_cells, ours), (plain.affine_of_cells, theirs)):
         draw(M, np.full(FACES, 1.5), texel, centres, angle, table, levels, cells, face, 2, 2, out)
     np.testing.assert_array_equal(ours, theirs)
     assert len(np.unique(ours[:, 0])) > 3
@@ -85,7 +86,7 @@ def test_faces_behind(world):
     room, cells = np.array([0, 2, 3]), rng.permutation(CELLS)[:40]
     ours, theirs = np.zeros((2, 3, 40), bool)
     kernels.faces_behind(M, room, corners, cells, ours)
-    kernels.faces_behind_numpy(M, room, corners, cells, theirs)
+    plain.faces_behind(M, room, corners, cells, theirs)
     np.testing.assert_array_equal(ours, theirs)
     assert ours.any(axis=0).all() and (ours.sum(axis=0) > 1).any()
 
@@ -96,6 +97,6 @@ def test_placed_texels(samples):
     texels, cells = rng.integers(0, 256, (6, 64 * samples), np.uint8), np.array([7, 0, 3, 11, 5, 8])
     ours, theirs = np.zeros((2, 3, 8, 4, 8), np.uint8)
     kernels.place_texels(texels, cells, samples, ours)
-    kernels.place_texels_numpy(texels, cells, samples, theirs)
+    plain.place_texels(texels, cells, samples, theirs)
     np.testing.assert_array_equal(ours, theirs)
     assert ours[1, 2, 3, 5] == round(texels[0, 21 * samples: 22 * samples].mean() + 1e-9)

@@ -78,6 +78,11 @@ def test_a_plan_is_committed_once_no_way_out_is_left():
     assert ways.next(1.0) is None and not ways.committed(0.4) and ways.committed(0.6) == "thrust"
 
 
+@pytest.mark.parametrize("covered, last", [(0.7, 1.0), (0.94, 1.0), (0.96, None)])
+def test_the_last_way_out_is_as_late_as_it_may_be_unless_one_begins_just_before_it(covered, last):
+    assert WaysOut(covered, until=1.0, spacing=0.4).next(0.9) == last
+
+
 @pytest.mark.parametrize("before", [1.2, 0.25])
 def test_a_cancelled_perch_leaves_by_a_way_out_and_ends_in_a_hover(before):
     flown = fly_cancelled("surface_90", 1, before)
@@ -87,7 +92,7 @@ def test_a_cancelled_perch_leaves_by_a_way_out_and_ends_in_a_hover(before):
 
 def test_cancelled_too_late_the_perch_goes_on():
     flown = fly_cancelled("surface_90", 1, 0.1)
-    assert flown.end == "attached" and flown.message.startswith("cancelled too late: perched (")
+    assert flown.end == "attached" and flown.perched and flown.message.startswith("cancelled too late: perched (")
 
 
 @pytest.mark.parametrize("left", [0.8, 0.4, 0.2])

@@ -14,13 +14,12 @@ All quantities are those at the time at which the command takes effect. `InnerLo
 
 from __future__ import annotations
 
-from math import exp
 from typing import TYPE_CHECKING, NamedTuple
 
 from perch_control.geometric.controller import packed_vehicle
 from perch_control.geometric.step import predicted, wrench_of
 from perch_control.period import NOMINAL_PERIOD
-from perch_control.rotor_lag import RotorEstimate, approached, thrusts
+from perch_control.rotor_lag import RotorEstimate, approached, lag_share, thrusts
 from perch_core.jit import compiled
 from perch_core.vector3 import axpy, cross, limited, scale, times, turned
 from perch_core.vehicle import Vehicle
@@ -160,8 +159,8 @@ class InnerLoopEstimate(NamedTuple):
             w_C: feed-forward rates of an attitude loop [rad/s].
         """
         a, tau, nominal = vehicle.actuation, vehicle.motor_time_constant, self.nominal
-        reached = approached(self.at_effect.speed, command, 1.0 if tau <= 0.0 else 1.0 - exp(-self.period / tau))
-        share = 1.0 - exp(-self.period / a.thrust_lag)
+        reached = approached(self.at_effect.speed, command, lag_share(self.period, tau))
+        share = lag_share(self.period, a.thrust_lag)
         thrust_ratio = vehicle.thrust_coefficient / nominal.thrust_coefficient
         *rates, thrust = loop_command(thrusts(reached, vehicle.thrust_coefficient), state[10:13], thrust_ratio * self.thrust,
                                       a.rate_lag, share, packed_vehicle(vehicle))

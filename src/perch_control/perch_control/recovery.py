@@ -103,7 +103,3 @@ class Recovery(ByState):
         after = copy(self)
         after._origin = axpy(1.0, p, axpy(-1.0, self._setpoint.p, self._origin))
         return after
-
-    def setpoint(self, t: float) -> Setpoint:
-        """Return the demand of the last `update`: an acceleration with zero position and velocity error."""
-        return self._setpoint

@@ -90,22 +90,11 @@ class ByState:
     """A reference that is guidance by state: a function of the state in its last update, without preview."""
 
     duration = float("inf")
+    _setpoint: Setpoint
 
-
-class Resting:
-    """Hover at the origin, as a running reference for the warm-up of a control law."""
-
-    elapsed = 0.0
-    duration = 0.0
-
-    @property
-    def source(self) -> Resting:
-        """The reference itself."""
-        return self
-
-    def setpoint(self, ahead: float = 0.0) -> Setpoint:
-        """Return the same setpoint at every time."""
-        return Setpoint((0.0, 0.0, 0.0))
+    def setpoint(self, t: float) -> Setpoint:
+        """Return the demand of the last update: an acceleration with zero position and velocity error."""
+        return self._setpoint
 
 
 @compiled

@@ -15,8 +15,14 @@ from perch_core.vehicle import Vehicle
 
 
 @compiled
+def lag_share(duration, time_constant):
+    """Fraction of the way to its target that a first-order lag covers in a time [s]."""
+    return 1.0 if time_constant <= 0.0 else 1.0 - exp(-duration / time_constant)
+
+
+@compiled
 def approached(speed, target, share):
-    """Rotor speeds after the fraction `share` = `1 - exp(-t / tau)` of the way to their targets [rad/s], 4 floats."""
+    """Rotor speeds after the fraction `share` of the way to their targets [rad/s], 4 floats."""
     return (
         speed[0] + share * (target[0] - speed[0]), speed[1] + share * (target[1] - speed[1]),
         speed[2] + share * (target[2] - speed[2]), speed[3] + share * (target[3] - speed[3]),
@@ -56,15 +62,14 @@ def leading_command(speed, thrust, coefficient, share, speed_min, speed_max):
     )
 
 
-def lag_behind(time_constant: float, lead: float, period: float) -> float:
+@compiled
+def lag_behind(time_constant, lead, period):
     """Delay with which rotors follow steadily changing wanted speeds, with a new `leading_command` in every period [s].
 
     In each period the rotors cover the fraction a = (1 - exp(-period / tau)) / (1 - exp(-lead / tau)) of the way, so that they
     lag by period / a. This is less than `lead`, after which they would arrive if the command stayed constant.
     """
-    if time_constant <= 0.0:
-        return period
-    return period * (1.0 - exp(-lead / time_constant)) / (1.0 - exp(-period / time_constant))
+    return period * lag_share(lead, time_constant) / lag_share(period, time_constant)
 
 
 class RotorEstimate(NamedTuple):
@@ -86,8 +91,7 @@ class RotorEstimate(NamedTuple):
 
     def after(self, duration: float, time_constant: float) -> RotorEstimate:
         """The same rotors `duration` seconds later, still following their command."""
-        share = 1.0 if time_constant <= 0.0 else 1.0 - exp(-duration / time_constant)
-        return RotorEstimate(approached(self.speed, self.command, share), self.command)
+        return RotorEstimate(approached(self.speed, self.command, lag_share(duration, time_constant)), self.command)
 
     def following(self, command: tuple[float, ...], *_: object) -> RotorEstimate:
         """The same rotors with a new command."""

@@ -61,10 +61,6 @@ class WeakLanding(ByState):
             f = scale(thrust_max, direction) if direction is not None else f
         self._setpoint = Setpoint(p, v, (f[0], f[1], f[2] - GRAVITY), h=self._setpoint.h)
 
-    def setpoint(self, t: float) -> Setpoint:
-        """Return the demand of the last `update`: an acceleration with zero position and velocity error."""
-        return self._setpoint
-
     def resting(self, state: tuple[float, ...]) -> bool:
         """Whether the commanded descent does not take place, because something carries the vehicle."""
         return abs(state[5]) < min(0.1, 0.5 * self._speed)

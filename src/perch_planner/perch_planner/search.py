@@ -16,7 +16,7 @@ from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_h
 from perch_planner.rotor_thrusts import rotor_model
 from perch_planner.segment_program import COST_ORDER, SegmentProgram
 from perch_planner.time_allocation import (
-    FINE_DIVISIONS, allocate, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
+    FINE_DIVISIONS, allocate, initial_durations, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
 from perch_planner.yaw_profile import yaw_coefficients
 
 STARTS = ((1.0, 100), (1.25, 75), (0.8, 75), (0.55, 50), (0.45, 40))
@@ -96,7 +96,8 @@ class Search:
         self.problem, self.settings, self.vehicle, self.limits = problem, settings, vehicle, limits
         self.low, self.high = limits.thrust[0] / vehicle.mass, limits.thrust[1] / vehicle.mass
         self.contact = Contact(problem, settings, vehicle.perch_offset)
-        self.initial_durations = allocate(problem, settings, self.contact.points)
+        self._allocated = allocate(problem, settings, self.contact.points)
+        self.initial_durations = initial_durations(problem, settings, self._allocated)
         self.end_yaw = contact_heading(problem.surface)
         self.plan_limits = PlanLimits(
             problem.surface.p_WS, problem.target_velocity, problem.surface.normal.copy(), turn_direction(self.end_yaw), self.low,
@@ -178,7 +179,7 @@ class Search:
         found: list[Found] = []
         for factor, programs in STARTS:
             self._iterations_end = min(self.iterations + programs, self._iterations_max)
-            first = allocate(replace(self.problem, segment_times=None), self.settings, self.contact.points) if found else self.initial_durations
+            first = self._allocated if found else self.initial_durations
             found.append(self._run_from(with_last_segment(factor * first, self.settings)))
             if found[-1].outcome.proved:
                 return found[-1]

@@ -76,9 +76,7 @@ def _along_waypoints(points: Array, v_start: Array, v_end: Array, speed: float, 
 
 
 def allocate(problem: PerchProblem, settings: PerchSettings, points: np.ndarray) -> np.ndarray:
-    """Initial durations: those of a speed profile along the waypoints, or of the problem, where they are not far too short.
-
-    Durations only grow, all by one factor where a leg to a waypoint is too short: a short one would make all others long.
+    """Durations of a speed profile along the waypoints.
 
     Args:
         problem: start, waypoints, target velocity.
@@ -88,12 +86,19 @@ def allocate(problem: PerchProblem, settings: PerchSettings, points: np.ndarray)
     Returns:
         Durations [s], shape (len(waypoints) + 1,).
     """
-    profile = _along_waypoints(points, problem.start.v, problem.target_velocity, CRUISE_SPEED, CRUISE_ACCELERATION,
-                               TURN_ACCELERATION, max(settings.tube_time, LAST_SEGMENT_MIN))
+    return _along_waypoints(points, problem.start.v, problem.target_velocity, CRUISE_SPEED, CRUISE_ACCELERATION,
+                            TURN_ACCELERATION, max(settings.tube_time, LAST_SEGMENT_MIN))
+
+
+def initial_durations(problem: PerchProblem, settings: PerchSettings, allocated: np.ndarray) -> np.ndarray:
+    """Durations from which a search begins: those of the problem, where they are not far too short, or else the allocated ones.
+
+    Durations only grow, all by one factor where a leg to a waypoint is too short: a short one would make all others long.
+    """
     if problem.segment_times is None:
-        return profile
+        return allocated
     guess = np.array(problem.segment_times)
-    guess[:-1] = np.maximum(guess[:-1], GUESS_SHARE_MIN * profile[:-1])
+    guess[:-1] = np.maximum(guess[:-1], GUESS_SHARE_MIN * allocated[:-1])
     return with_last_segment(guess, settings)
 
 

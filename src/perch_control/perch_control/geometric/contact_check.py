@@ -7,7 +7,6 @@ elsewhere than planned, in the same way each time. This can be computed before t
 
 from __future__ import annotations
 
-from math import exp
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +18,7 @@ from perch_core.vehicle import GRAVITY, Vehicle
 from perch_control.geometric.law import cone_before_contact
 from perch_control.geometric.step import control_step, drag_compensation, predicted
 from perch_control.reference import Setpoint, Source, packed_many
-from perch_control.rotor_lag import RotorEstimate, approached, thrusts
+from perch_control.rotor_lag import RotorEstimate, approached, lag_share, thrusts
 
 if TYPE_CHECKING:
     from perch_control.geometric.controller import GeometricController
@@ -33,8 +32,7 @@ def simulate(start, speed, table, gains, limits, settling, lead, lag, period, ve
     state, command = start, speed
     duration, mass, J = len(table) * period, vehicle[0][0], vehicle[0][1:4]
     coefficient, _, _, tau = vehicle[1]
-    share = 1.0 if tau <= 0.0 else 1.0 - exp(-period / tau)
-    middle = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * period / tau)
+    share, middle = lag_share(period, tau), lag_share(0.5 * period, tau)
     none = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for k in range(len(table)):
         r = table[k]

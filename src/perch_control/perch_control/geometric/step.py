@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from math import exp
-
 from perch_core.jit import compiled
 from perch_core.vector3 import axes_of, axpy, cross, dot, scale, times, turned
 from perch_core.vehicle import GRAVITY
 from perch_control.allocation import allocate
 from perch_control.geometric.law import geometric_step
-from perch_control.rotor_lag import approached, leading_command, reachable, thrusts
+from perch_control.rotor_lag import approached, lag_share, leading_command, reachable, thrusts
 
 
 @compiled
@@ -67,6 +65,15 @@ def drag_compensation(q, v, drag, extra):
 
 
 @compiled
+def predicted_with_lag(state, speed, command, extra, duration, vehicle):
+    """As `predicted`, under rotor drag and the thrusts that the rotors have in the middle of the time; arguments as in `control_step`."""
+    coefficient, _, _, tau = vehicle[1]
+    f = thrusts(approached(speed, command, lag_share(0.5 * duration, tau)), coefficient)
+    with_drag = drag_compensation(state[6:10], state[3:6], vehicle[4], extra)
+    return predicted(state, f, with_drag, duration, vehicle[0][0], vehicle[0][1:4], vehicle[2])
+
+
+@compiled
 def rotors_for(wrench, speed, vehicle, lead):
     """Rotor commands that reach a wrench after the lead time, with priority of tilt over thrust over yaw.
 
@@ -80,7 +87,7 @@ def rotors_for(wrench, speed, vehicle, lead):
         Commanded speeds [rad/s] and the thrusts that they reach [N], 4 floats each.
     """
     coefficient, speed_min, speed_max, tau = vehicle[1]
-    share = 1.0 if tau <= 0.0 else 1.0 - exp(-lead / tau)
+    share = lag_share(lead, tau)
     low, high = reachable(speed, share, speed_min, speed_max)
     lo, hi = thrusts(low, coefficient), thrusts(high, coefficient)
     floor, ceiling = coefficient * speed_min * speed_min, coefficient * speed_max * speed_max
@@ -109,11 +116,7 @@ def control_step(state, reference, speed, command, extra, gains, limits, lead, l
         q_C (4), w_C and dw_C in B (3, 3).
     """
     mass, J = vehicle[0][0], vehicle[0][1:4]
-    coefficient, _, _, tau = vehicle[1]
-    half = 1.0 if tau <= 0.0 else 1.0 - exp(-0.5 * lag / tau)
-    f_mid = thrusts(approached(speed, command, half), coefficient)
-    with_drag = drag_compensation(state[6:10], state[3:6], vehicle[4], extra)
-    ahead = predicted(state, f_mid, with_drag, lag, mass, J, vehicle[2])
+    ahead = predicted_with_lag(state, speed, command, extra, lag, vehicle)
     # The wanted velocity, not the measured one: its noise would come back as thrust.
     extra = drag_compensation(ahead[6:10], reference[3:6], vehicle[4], extra)
     thrust, M, q_C, w_C, dw_C = geometric_step(ahead, reference, extra, gains, limits, J)

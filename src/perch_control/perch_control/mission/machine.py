@@ -40,6 +40,8 @@ class MissionMachine(ABC):
     """Message while no target is detected."""
     target_channel = "target/pose"
     """Channel of the target: this one, or `powerlines`."""
+    unless = ""
+    """Follows "cancelled too late" where the running plan ends in a recovery of its own; empty: it ends at the contact."""
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         """
@@ -98,7 +100,7 @@ class MissionMachine(ABC):
         """Act once the target has been seen for long enough and the vehicle rests."""
 
     def committed(self, time: float) -> str:
-        """Return why the running plan can no longer be left at a time [s]; empty: it can."""
+        """Return why no way out of the running plan is left at a time [s]; empty: there is one, or no plan."""
         return ""
 
     def holds(self, inputs: Inputs) -> bool:
@@ -284,13 +286,14 @@ class MissionMachine(ABC):
             # By now it may have taken off: one of the two is refused.
             outputs.commands += [(Command.LAND, "cancelled"), (Command.DISARM, "cancelled")]
             self._end(outputs, Result.CANCELLED, "cancelled on the ground")
-        elif why := self.committed(inputs.time):
-            self._too_late = why
-            self.message = f"cancelled too late: {why}"
         else:
-            if inputs.controller is not ControllerState.LANDING:
-                outputs.commands.append((Command.HOVER, "cancelled"))
-            self._fail_attempt(inputs, "cancelled")
+            self._too_late = self.committed(inputs.time)
+            if self.unless or not self._too_late:
+                if inputs.controller is not ControllerState.LANDING:
+                    outputs.commands.append((Command.HOVER, "cancelled"))
+                self._fail_attempt(inputs, "cancelled")
+            if self._too_late:
+                self.message = f"cancelled too late{self.unless}: {self._too_late}"
 
     def _end(self, outputs: Outputs, result: Result, message: str, contact_time: float = float("nan")) -> None:
         outputs.outcome = Outcome(result, message, contact_time)

@@ -12,6 +12,7 @@ from perch_control.mission.machine import MissionMachine
 from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
+from perch_control.mission.ways_out import WaysOut
 
 PERCH_ACCEPTANCE_TIMEOUT = 0.5  # a controller that still hovers so long after a plan's start has not accepted it [s]
 REPLACED_TIMEOUT = 0.1    # a plan that is still flown so long after its successor's start has not been replaced [s]
@@ -20,13 +21,16 @@ _IN_FLIGHT = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerStat
 
 
 class InFlight(Protocol):
-    """A plan in flight, and the target that it was made for."""
+    """A plan in flight, the target that it was made for, and the ways out of it."""
 
     @property
     def plan(self) -> Plan: ...
 
     @property
     def target(self) -> Target: ...
+
+    @property
+    def ways_out(self) -> WaysOut: ...
 
 
 R = TypeVar("R", bound=InFlight)
@@ -68,6 +72,10 @@ class PerchingMission(MissionMachine, Generic[R]):
     def contact_awaited(self, inputs: Inputs, outputs: Outputs) -> bool:
         """Whether the contact is still awaited."""
         return inputs.time <= self._running.plan.end + self.settings.contact_time + 0.2
+
+    def committed(self, time: float) -> str:
+        """As in the base class; ways out end shortly before the contact, or where the planner finds none."""
+        return self._running.ways_out.committed(time) if self.phase in (Phase.TRACKING, Phase.VERIFYING) else ""
 
     def on_no_contact(self, outputs: Outputs) -> None:
         """Act on a contact that was not detected."""

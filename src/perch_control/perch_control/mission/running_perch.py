@@ -10,9 +10,7 @@ import numpy as np
 
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Goal, Plan, PlanQuery, Refusal, Target
-from perch_control.mission.ways_out import DECISION, WaysOut
-
-_SPACING = 0.05  # between the starts of ways out [s]
+from perch_control.mission.ways_out import DECISION, SPACING_MIN, WaysOut
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class RunningPerch:
     @classmethod
     def from_plan(cls, plan: Plan, target: Target, settings: MissionSettings) -> RunningPerch:
         """Return a planner's answer as a plan in flight; there is no way out within `contact_early` before the contact."""
-        return cls(plan, target, target, WaysOut(plan.start_time - _SPACING, plan.end - settings.contact_early, _SPACING))
+        return cls(plan, target, target, WaysOut(plan.start_time - SPACING_MIN, plan.end - settings.contact_early, SPACING_MIN))
 
     def way_out(self, time: float, goal: Goal, settings: MissionSettings) -> PlanQuery | None:
         """Return the query for the next way out at the time of a tick [s]; None: no further one is needed."""

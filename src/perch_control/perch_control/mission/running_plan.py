@@ -39,7 +39,7 @@ class RunningPlan:
 
     def __init__(self, plan: Plan, target: Target, settings: MissionSettings, states: SampledTrajectory, replanned_at: float = -math.inf) -> None:
         self.plan, self.target, self.states = plan, target, states
-        self.ways_out = WaysOut(plan.start_time, plan.end - settings.way_out_until, settings.way_out_spacing, closing=True)
+        self.ways_out = WaysOut(plan.start_time, plan.end - settings.way_out_until, settings.way_out_spacing)
         self._settings, self._replanned_at = settings, replanned_at
         self._pending_query: PlanQuery | None = None
         self._departure_requested = False  # the way out from the wire has been requested

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from perch_control.mission.perching import PerchingMission
 from perch_control.mission.running_perch import RunningPerch
-from perch_control.mission.values import Command, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Target
+from perch_control.mission.values import Command, Inputs, Outputs, Plan, PlanQuery, Refusal, Target
 from perch_control.mission.ways_out import WaysOut
 
 
@@ -62,7 +62,3 @@ class SurfaceMission(PerchingMission[RunningPerch]):
     def on_no_contact(self, outputs: Outputs) -> None:
         """Command a hover: the trajectory ends at the contact."""
         outputs.commands.append((Command.HOVER, "no adhesion"))
-
-    def committed(self, time: float) -> str:
-        """As in the base class; ways out end shortly before the contact, or where the planner finds none."""
-        return self._running.ways_out.committed(time) if self.phase in (Phase.TRACKING, Phase.VERIFYING) else ""

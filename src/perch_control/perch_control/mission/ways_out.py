@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from perch_control.mission.values import TICK
-
 DECISION = 0.04  # from an answer to the start of what it brings: the mission's latency and a tick [s]
+SPACING_MIN = 0.05  # between two starts [s]
 
 
 @dataclass
@@ -15,10 +14,9 @@ class WaysOut:
     """Start times of the ways out of one plan.
 
     Attributes:
-        covered: start of the last one that was answered [s]; the next one begins at least `spacing` later.
-        until: every start is before this time [s].
-        spacing: least time between two starts [s].
-        closing: whether one more begins at `until`, less than `spacing` after the one before.
+        covered: start of the last one that was answered [s]; the next one begins `spacing` later.
+        until: start of the last one [s], unless it is nearer than `SPACING_MIN` to the one before.
+        spacing: least time between the others [s].
         last: start of the latest one that was found [s].
         refusal: why the one at `covered` was refused; empty: it was not.
     """
@@ -26,16 +24,14 @@ class WaysOut:
     covered: float
     until: float
     spacing: float
-    closing: bool = False
     last: float = -math.inf
     refusal: str = ""
 
     def next(self, soonest: float) -> float | None:
         """Return the start of the next one to request [s], not before `soonest`; None: all have been requested."""
-        start = max(soonest, self.covered + self.spacing)
-        if start < self.until:
-            return start
-        return self.until if self.closing and max(soonest, self.covered + TICK) <= self.until else None
+        if max(soonest, self.covered + SPACING_MIN) >= self.until:
+            return None
+        return min(max(soonest, self.covered + self.spacing), self.until)
 
     def answered(self, start: float, refusal: str) -> None:
         """Take the answer to the request for the one that begins at `start` [s]; an empty refusal: it was found."""

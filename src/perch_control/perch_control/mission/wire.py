@@ -10,7 +10,7 @@ from perch_control.mission.machine import MissionMachine
 from perch_control.mission.moves import SearchPlace
 from perch_control.mission.perching import PerchingMission
 from perch_control.mission.running_plan import RunningPlan
-from perch_control.mission.values import Inputs, Outputs, Phase, Plan, Target
+from perch_control.mission.values import Inputs, Outputs, Plan, Target
 
 MAPPING_REACH = 0.8  # how far the vehicle moves up to see lines from other places [m]
 MAPPING_LEGS = 3     # moves of the pattern before a plan: up, nearer, down; perches begin from the near place
@@ -34,6 +34,8 @@ class LineMission(MissionMachine):
 
 class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
     """Map the lines, plan a perch with its recovery, fly it with ways out kept ready."""
+
+    unless = ", unless the gripper fails"
 
     @property
     def legs(self) -> int:
@@ -69,14 +71,6 @@ class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
             self._running = shifted
             outputs.perch, outputs.trajectory_id = shifted.plan, self._flown_id
         outputs.query = self._running.query(inputs.time, inputs.state, target, self._goal)
-
-    def _cancel(self, inputs: Inputs, outputs: Outputs) -> None:
-        """As in the base class; where only the recovery from the wire is left, the gripper may close before it."""
-        flown = self.phase in (Phase.TRACKING, Phase.VERIFYING)
-        super()._cancel(inputs, outputs)
-        self._too_late = self._running.ways_out.committed(inputs.time) if flown else ""
-        if self._too_late:
-            self.message = f"cancelled too late, unless the gripper fails: {self._too_late}"
 
     def contact_awaited(self, inputs: Inputs, outputs: Outputs) -> bool:
         """Whether the contact is still awaited. Ways out are requested until the plan continues into its own recovery."""

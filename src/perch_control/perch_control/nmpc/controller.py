@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from perch_control.flight_state import FlightState
 from perch_control.geometric import GeometricController, packed_vehicle
 from perch_control.geometric.controller import ACCELERATION_MAX
 from perch_control.law import NO_COMPENSATION, ControlOutput, Law
@@ -19,7 +20,7 @@ from perch_control.nmpc.reference_rows import ReferenceRows
 from perch_control.nmpc.riccati import Workspace
 from perch_control.nmpc.settings import NmpcSettings
 from perch_control.period import NOMINAL_PERIOD
-from perch_control.reference import ByState, Following, Resting
+from perch_control.reference import ByState, Following
 from perch_control.rotor_lag import RotorEstimate
 from perch_core.errors import ConfigError
 from perch_core.jit import COMPILED
@@ -87,7 +88,7 @@ class NmpcController(Law):
         """Run one step in hover, so that everything that is compiled on first use is compiled."""
         hover = (self.vehicle.speed_min + self.vehicle.speed_max) / 2
         rest = (0.0,) * 6 + (0.0, 0.0, 0.0, 1.0) + (0.0,) * 3
-        self.control(rest, Resting(), RotorEstimate((hover,) * 4, (hover,) * 4))
+        self.control(rest, FlightState.disarmed(self.vehicle), RotorEstimate((hover,) * 4, (hover,) * 4))
         self._warm, self.failures = False, 0
 
     def _update_weights(self) -> None:

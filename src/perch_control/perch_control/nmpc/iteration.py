@@ -5,12 +5,10 @@
 
 from __future__ import annotations
 
-from math import exp
-
-from perch_control.geometric.step import drag_compensation, predicted, rotors_for, wrench_of
+from perch_control.geometric.step import predicted_with_lag, rotors_for, wrench_of
 from perch_control.nmpc.model import DISTURBANCE, INPUTS, REFERENCE
 from perch_control.nmpc.riccati import solve_stages
-from perch_control.rotor_lag import approached, reachable, thrusts
+from perch_control.rotor_lag import lag_share, reachable, thrusts
 from perch_core.jit import compiled
 
 
@@ -35,12 +33,9 @@ def begin(state, speed, command, compensation, lead, vehicle, R, ramps, X, U, st
         z: result: arguments, shape (N + 1, .).
     """
     nodes, n = X.shape
-    coefficient, speed_min, speed_max, tau = vehicle[1]
+    coefficient, speed_min, speed_max, _ = vehicle[1]
     if n == 13:
-        half = 1.0 - exp(-0.5 * lead / max(tau, 1e-9))
-        f = thrusts(approached(speed, command, half), coefficient)
-        with_drag = drag_compensation(state[6:10], state[3:6], vehicle[4], compensation)
-        state = predicted(state, f, with_drag, lead, vehicle[0][0], vehicle[0][1:4], vehicle[2])
+        state = predicted_with_lag(state, speed, command, compensation, lead, vehicle)
     for i in range(3):
         start[i], start[7 + i], start[10 + i] = state[i], state[3 + i], state[10 + i]
     for i in range(4):
@@ -82,7 +77,7 @@ def input_bounds(speed, lead, vehicle, thrust_rate_max, n, low, high):
         for a in range(4):
             low[k, a], high[k, a] = floor, ceiling
     if n == 13:
-        slow, fast = reachable(speed, 1.0 - exp(-lead / max(tau, 1e-9)), speed_min, speed_max)
+        slow, fast = reachable(speed, lag_share(lead, tau), speed_min, speed_max)
         slow, fast = thrusts(slow, coefficient), thrusts(fast, coefficient)
         for a in range(4):
             low[0, a], high[0, a] = slow[a], fast[a]

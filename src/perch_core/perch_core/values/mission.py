@@ -42,7 +42,7 @@ class PerchFeedback(NamedTuple):
 
 
 class PerchResult(NamedTuple):
-    """Result of a goal; `error_code` as in perch_msgs/action/Perch, times [s], final pose estimated in W."""
+    """Result of a goal; `error_code` as in perch_msgs/action/Perch, times [s] (`contact_time` NaN: not perched), final pose estimated in W."""
 
     success: bool
     error_code: int

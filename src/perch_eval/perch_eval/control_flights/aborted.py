@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perch_core.values import NANOSECONDS, ControllerStatus, seconds
+from perch_core.values import NANOSECONDS, ControllerStatus, PerchResult, seconds
 from perch_control.modes import State
 from perch_eval.goal import goal_of
 from perch_eval.in_process import Sensing, arrange
@@ -27,6 +27,7 @@ class CancelledFlight:
         before: time of the cancellation before the planned contact [s].
         planned: whether the vehicle left the plan by a planned way out.
         end: true end: never cancelled, broken (crashed), attached or hovering; otherwise the controller's state.
+        perched: whether the mission reports a perch: the goal was cancelled too late.
         message: message of the mission's result.
         rate: largest body rate after the cancellation [rad/s].
         margin: least thrust margin of the controller after the cancellation.
@@ -39,6 +40,7 @@ class CancelledFlight:
     before: float
     planned: bool
     end: str
+    perched: bool
     message: str
     rate: float
     margin: float
@@ -74,6 +76,7 @@ def fly_cancelled(scenario: str, seed: int, before: float) -> CancelledFlight:
     held = simulation.plant.contact.attached or simulation.plant.cables.hold.active
     end = ("never cancelled" if not cancelled else "broken" if simulation.plant.crashed else "attached" if held else
            "hovering" if hovering else state.name.lower())
-    return CancelledFlight(scenario, seed, before, any("as planned" in s.message for s in statuses), end,
-                           goal.result.message if goal.result else "no end", rate, min(s.thrust_margin for s in statuses), distance,
+    result = goal.result or PerchResult(False, 0, "no end")
+    return CancelledFlight(scenario, seed, before, any("as planned" in s.message for s in statuses), end, bool(np.isfinite(result.contact_time)),
+                           result.message, rate, min(s.thrust_margin for s in statuses), distance,
                            seconds(max(ended, cancelled) - cancelled))

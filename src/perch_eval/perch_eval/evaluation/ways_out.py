@@ -134,8 +134,8 @@ def _too_late_at(scenario: str) -> float:
 
 
 def _too_late(r: dict[str, Any]) -> bool:
-    """Return whether a flight is attached, as the mission says it is, because no way out could begin before the contact."""
-    return r["end"] == "attached" and r["before"] < _too_late_at(r["scenario"]) and r["message"].startswith("cancelled too late")
+    """Return whether a flight is attached, as the mission reports, because no way out could begin before the contact."""
+    return r["end"] == "attached" and r["before"] < _too_late_at(r["scenario"]) and r["perched"]
 
 
 def _fly_cancelled(job: tuple[str, int, float]) -> dict[str, Any]:

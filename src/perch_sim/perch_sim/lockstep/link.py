@@ -14,7 +14,7 @@ import socket
 import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from multiprocessing.connection import Client, Connection, Listener
+from multiprocessing.connection import Client, Connection
 
 from perch_core.errors import PerchError
 from perch_sim.lockstep.packet import Codec, Packet
@@ -75,7 +75,7 @@ def unpack(data: bytes, codec: Codec) -> tuple[int, list[Packet]]:
 
 
 def claimed(where: str) -> socket.socket:
-    """Return a socket at the address of a vehicle in real time, to which nobody connects: while it is open, there is no other vehicle.
+    """Return a socket at the address of a vehicle: while it is open, there is no other vehicle. Nobody can connect before it listens.
 
     Raises:
         PerchError: another vehicle has this address.
@@ -85,14 +85,10 @@ def claimed(where: str) -> socket.socket:
         claim.bind(where)
     except OSError as error:
         claim.close()
-        raise _refusal(where, error) from None
+        if error.errno == errno.EADDRINUSE:
+            raise PerchError("another vehicle runs in this ROS domain and namespace") from None
+        raise PerchError(f"vehicle: cannot have the address {where[1:]!r}: {error}") from None
     return claim
-
-
-def _refusal(where: str, error: OSError) -> PerchError:
-    if error.errno != errno.EADDRINUSE:
-        return PerchError(f"vehicle: cannot have the address {where[1:]!r}: {error}")
-    return PerchError("another vehicle runs in this ROS domain and namespace")
 
 
 class ParticipantListener:
@@ -101,28 +97,25 @@ class ParticipantListener:
     def __init__(self, where: str) -> None:
         """
         Raises:
-            PerchError: another vehicle listens at this address, or listening fails.
+            PerchError: another vehicle has this address.
         """
-        try:
-            self._listener = Listener(where, "AF_UNIX", backlog=16)
-        except OSError as error:
-            raise _refusal(where, error) from None
-        self._socket: socket.socket = self._listener._listener._socket  # type: ignore[attr-defined]  # non-blocking accept
+        self._socket = claimed(where)
         self._socket.setblocking(False)
+        self._socket.listen(16)
 
     def accept(self) -> list[tuple[str, frozenset[str], Connection]]:
         """Return the participants that have connected since the last call: name, input channels and connection."""
         accepted: list[tuple[str, frozenset[str], Connection]] = []
         while True:
             try:
-                connection = self._listener.accept()
-            except (BlockingIOError, OSError):
+                peer, _ = self._socket.accept()
+            except OSError:
                 return accepted
+            user = _PEER.unpack(peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_LIMIT)
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_LIMIT)
+            connection = Connection(peer.detach())
             try:
-                with socket.socket(fileno=os.dup(connection.fileno())) as peer:
-                    user = _PEER.unpack(peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
-                    peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_LIMIT)
-                    peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_LIMIT)
                 if user != os.getuid() or not connection.poll(1.0):
                     raise OSError("not the same user, or silent")
                 greeting = json.loads(connection.recv_bytes(1 << 16))
@@ -132,7 +125,7 @@ class ParticipantListener:
 
     def close(self) -> None:
         """Stop accepting participants."""
-        self._listener.close()
+        self._socket.close()
 
 
 class NonBlockingSender:

@@ -1,20 +1,33 @@
 """The renderer's inner loops over cells and samples, compiled.
 
 In numpy each arithmetic operation is a pass over all samples of all cells; compiled, a sample is computed in registers, and
-without the interpreter lock, so that rendering threads of one process do not block each other. The numpy functions are used
-where numba is not available, and as reference for the kernels in tests.
+without the interpreter lock, so that rendering threads of one process do not block each other. A test
+compares the loops with plain numpy (tests/oracles/renderer.py).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from perch_core.jit import COMPILED, compiled
+from perch_core.jit import compiled
 
 
 @compiled(nogil=True)
-def _classify(M: np.ndarray, half: np.ndarray, bounded: np.ndarray, nodes: np.ndarray, corner_nodes: np.ndarray,
-              first: np.ndarray, uniform: np.ndarray, shown: np.ndarray) -> None:
+def classify(M: np.ndarray, half: np.ndarray, bounded: np.ndarray, nodes: np.ndarray, corner_nodes: np.ndarray,
+             first: np.ndarray, uniform: np.ndarray, shown: np.ndarray) -> None:
+    """Determine the face that each cell shows.
+
+    Args:
+        M: matrices of the faces, see `View`, float32, shape (faces, 3, 3).
+        half: half extents, infinite where a face is not bounded, float32, shape (faces, 2) [m].
+        bounded: row in `shown` of each face, -1 for those without edges, shape (faces,).
+        nodes: rays at the corners of cells, float32, shape (3, n).
+        corner_nodes: each cell's corners, shape (cells, 4).
+        first: filled with the face at each cell's first corner, -1: none, shape (cells,).
+        uniform: filled with whether the cell shows that face alone, shape (cells,) bool.
+        shown: initially the cells that an edge of each bounded face crosses; cells in which a corner's ray hits the face
+            are added, shape (bounded faces, cells) bool.
+    """
     count = nodes.shape[1]
     winner = np.empty(count, np.int32)
     hits = np.zeros((len(shown), count), np.bool_)
@@ -47,9 +60,21 @@ def _classify(M: np.ndarray, half: np.ndarray, bounded: np.ndarray, nodes: np.nd
 
 
 @compiled(nogil=True)
-def _affine_of_cells(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, centres: np.ndarray, pixel_angle: np.ndarray,
-                     table: np.ndarray, levels: np.ndarray, cells: np.ndarray, face: np.ndarray, supersampling: int,
-                     levels_per_octave: int, out: np.ndarray) -> None:
+def affine_of_cells(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, centres: np.ndarray, pixel_angle: np.ndarray,
+                    table: np.ndarray, levels: np.ndarray, cells: np.ndarray, face: np.ndarray, supersampling: int,
+                    levels_per_octave: int, out: np.ndarray) -> None:
+    """Select the atlas level for each cell whose texels are about as large as a sample's footprint on the face.
+
+    Args:
+        M, distance: matrices and distances of the faces, see `View`.
+        texel: size of the faces' texels at level 0 [m], shape (faces,).
+        centres, pixel_angle: of the grid's cells, see `CellGrid`.
+        table, levels: `Atlas.affine`, `Atlas.levels`.
+        cells, face: the cells to draw and the face that each shows, shapes (n,).
+        supersampling: samples per pixel and direction.
+        levels_per_octave: `LEVELS_PER_OCTAVE` of the atlas.
+        out: filled with (sx, ox, sy, oy), float32, shape (n, 4).
+    """
     for i in range(len(cells)):
         f, cell = face[i], cells[i]
         inverse = max(M[f, 2, 0] * centres[cell, 0] + M[f, 2, 1] * centres[cell, 1] + M[f, 2, 2] * centres[cell, 2], 1e-3)
@@ -60,7 +85,16 @@ def _affine_of_cells(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, cen
 
 
 @compiled(nogil=True)
-def _faces_behind(M: np.ndarray, room: np.ndarray, corners: np.ndarray, cells: np.ndarray, shown: np.ndarray) -> None:
+def faces_behind(M: np.ndarray, room: np.ndarray, corners: np.ndarray, cells: np.ndarray, shown: np.ndarray) -> None:
+    """Find the faces of the room that are behind everything else, cell by cell.
+
+    Args:
+        M: matrices of the faces, see `View`, float32, shape (faces, 3, 3).
+        room: the faces without edges, shape (r,).
+        corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
+        cells: the cells to examine, shape (n,).
+        shown: set where a corner of the cell shows the face, shape (r, n) bool.
+    """
     for i in range(len(cells)):
         rays = corners[cells[i]]
         for c in range(4):
@@ -74,7 +108,15 @@ def _faces_behind(M: np.ndarray, room: np.ndarray, corners: np.ndarray, cells: n
 
 
 @compiled(nogil=True)
-def _place_texels(texels: np.ndarray, cells: np.ndarray, samples: int, image: np.ndarray) -> None:
+def place_texels(texels: np.ndarray, cells: np.ndarray, samples: int, image: np.ndarray) -> None:
+    """Average texels per pixel and write them to the image's cells.
+
+    Args:
+        texels: uint8, shape (n, pixels of a cell * samples).
+        cells: cells of the texels, shape (n,).
+        samples: number of samples per pixel.
+        image: uint8, shape (rows, size, columns, size) of cells.
+    """
     size, cols = image.shape[1], image.shape[2]
     for i in range(len(cells)):
         row, col = cells[i] // cols, cells[i] % cols
@@ -92,8 +134,18 @@ def _place_texels(texels: np.ndarray, cells: np.ndarray, samples: int, image: np
 
 
 @compiled(nogil=True)
-def _uniform_samples(M: np.ndarray, affine: np.ndarray, corners: np.ndarray, cells: np.ndarray, face: np.ndarray,
-                    weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+def uniform_samples(M: np.ndarray, affine: np.ndarray, corners: np.ndarray, cells: np.ndarray, face: np.ndarray,
+                   weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+    """Compute the atlas coordinates of the samples of cells that show one face each.
+
+    Args:
+        M: matrices of the faces, see `View`, float32, shape (faces, 3, 3).
+        affine: (sx, ox, sy, oy) of each cell's atlas level, shape (n, 4).
+        corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
+        cells, face: the cells to draw and the face that each shows, shapes (n,).
+        weights: of the corners at the samples, float32, shape (4, samples).
+        x, y: filled with the coordinates [texel], float32, shape (n, samples).
+    """
     q = np.empty((3, 4), np.float32)
     for i in range(len(cells)):
         m, rays = M[face[i]], corners[cells[i]]
@@ -116,8 +168,21 @@ def _uniform_samples(M: np.ndarray, affine: np.ndarray, corners: np.ndarray, cel
 
 
 @compiled(nogil=True)
-def _nearer_samples(m: np.ndarray, half: np.ndarray, affine: np.ndarray, corners: np.ndarray, cells: np.ndarray,
-                   rows: np.ndarray, weights: np.ndarray, nearest: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+def nearer_samples(m: np.ndarray, half: np.ndarray, affine: np.ndarray, corners: np.ndarray, cells: np.ndarray,
+                  rows: np.ndarray, weights: np.ndarray, nearest: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+    """Assign to one face the samples in which it is in front of the faces processed so far.
+
+    Args:
+        m: matrix of the face, see `View`, float32, shape (3, 3).
+        half: its half extents [m], infinite where it is not bounded, float32, shape (2,).
+        affine: (sx, ox, sy, oy) of the atlas level in each row, shape (r, 4).
+        corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
+        cells: the cells to draw, shape (n,).
+        rows: indices into `cells` of those in which the face may be visible, shape (r,).
+        weights: of the corners at the samples, float32, shape (4, samples).
+        nearest, x, y: inverse range [1/m] and atlas coordinates [texel] of the front face, float32, shape (n, samples);
+            changed where this face is in front.
+    """
     one = np.float32(1.0)
     big = np.float32(1e30)
     half_u, half_v = min(half[0], big), min(half[1], big)
@@ -145,142 +210,9 @@ def _nearer_samples(m: np.ndarray, half: np.ndarray, affine: np.ndarray, corners
                     to_y[s] = sy * (v * scale) + oy
 
 
-def classify_numpy(M: np.ndarray, half: np.ndarray, bounded: np.ndarray, nodes: np.ndarray, corner_nodes: np.ndarray,
-                   first: np.ndarray, uniform: np.ndarray, shown: np.ndarray) -> None:
-    """Determine the face that each cell shows.
-
-    Args:
-        M: matrices of the faces, see `View`, float32, shape (faces, 3, 3).
-        half: half extents, infinite where a face is not bounded, float32, shape (faces, 2) [m].
-        bounded: row in `shown` of each face, -1 for those without edges, shape (faces,).
-        nodes: rays at the corners of cells, float32, shape (3, n).
-        corner_nodes: each cell's corners, shape (cells, 4).
-        first: filled with the face at each cell's first corner, -1: none, shape (cells,).
-        uniform: filled with whether the cell shows that face alone, shape (cells,) bool.
-        shown: initially the cells that an edge of each bounded face crosses; cells in which a corner's ray hits the face
-            are added, shape (bounded faces, cells) bool.
-    """
-    q = (M.reshape(-1, 3) @ nodes).reshape(len(M), 3, nodes.shape[1])
-    inverse = q[:, 2]
-    hit = inverse > 1e-6
-    edged = np.flatnonzero(bounded >= 0)
-    hit[edged] &= np.all(np.abs(q[edged, :2]) <= half[edged][:, :, None] * inverse[edged][:, None, :], axis=1)
-    inverse = np.where(hit, inverse, -1.0)
-    winner = np.where(inverse.max(axis=0) > 0, inverse.argmax(axis=0), -1)[corner_nodes]
-    first[:] = winner[:, 0]
-    uniform[:] = (winner == first[:, None]).all(axis=1) & ~shown.any(axis=0)
-    shown[bounded[edged]] |= hit[edged][:, corner_nodes].any(axis=2)
-
-
-def affine_of_cells_numpy(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, centres: np.ndarray, pixel_angle: np.ndarray,
-                          table: np.ndarray, levels: np.ndarray, cells: np.ndarray, face: np.ndarray, supersampling: int,
-                          levels_per_octave: int, out: np.ndarray) -> None:
-    """Select the atlas level for each cell whose texels are about as large as a sample's footprint on the face.
-
-    Args:
-        M, distance: matrices and distances of the faces, see `View`.
-        texel: size of the faces' texels at level 0 [m], shape (faces,).
-        centres, pixel_angle: of the grid's cells, see `CellGrid`.
-        table, levels: `Atlas.affine`, `Atlas.levels`.
-        cells, face: the cells to draw and the face that each shows, shapes (n,).
-        supersampling: samples per pixel and direction.
-        levels_per_octave: `LEVELS_PER_OCTAVE` of the atlas.
-        out: filled with (sx, ox, sy, oy), float32, shape (n, 4).
-    """
-    footprint = texels_per_pixel(M, distance, texel, centres, pixel_angle, cells, face) / supersampling
-    level = np.rint(levels_per_octave * np.log2(footprint))
-    out[:] = table[face, np.clip(level, 0, levels[face] - 1).astype(int)]
-
-
 def texels_per_pixel(M: np.ndarray, distance: np.ndarray, texel: np.ndarray, centres: np.ndarray, pixel_angle: np.ndarray,
                      cells: np.ndarray, face: np.ndarray) -> np.ndarray:
     """Return the geometric mean of a pixel's footprint on faces [texel] at cell centres, (n,); arguments as `affine_of_cells`."""
     inverse = np.maximum(np.einsum("ij,ij->i", M[face, 2], centres[cells]), 1e-3)
     slant = np.clip(inverse * distance[face], 0.02, 1.0)  # cosine between ray and normal
     return pixel_angle[cells] / (inverse * texel[face] * np.sqrt(slant))
-
-
-def faces_behind_numpy(M: np.ndarray, room: np.ndarray, corners: np.ndarray, cells: np.ndarray, shown: np.ndarray) -> None:
-    """Find the faces of the room that are behind everything else, cell by cell.
-
-    Args:
-        M: matrices of the faces, see `View`, float32, shape (faces, 3, 3).
-        room: the faces without edges, shape (r,).
-        corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
-        cells: the cells to examine, shape (n,).
-        shown: set where a corner of the cell shows the face, shape (r, n) bool.
-    """
-    behind = (M[room, 2] @ corners[cells]).argmax(axis=1)  # (n, 4)
-    shown[behind, np.arange(len(cells))[:, None]] = True
-
-
-def place_texels_numpy(texels: np.ndarray, cells: np.ndarray, samples: int, image: np.ndarray) -> None:
-    """Average texels per pixel and write them to the image's cells.
-
-    Args:
-        texels: uint8, shape (n, pixels of a cell * samples).
-        cells: cells of the texels, shape (n,).
-        samples: number of samples per pixel.
-        image: uint8, shape (rows, size, columns, size) of cells.
-    """
-    size, cols = image.shape[1], image.shape[2]
-    total = texels.reshape(len(cells), size, size, samples).sum(axis=-1, dtype=np.int64)
-    row, col = np.divmod(cells, cols)
-    image[row, :, col, :] = (total + samples // 2) // samples
-
-
-def uniform_samples_numpy(M: np.ndarray, affine: np.ndarray, corners: np.ndarray, cells: np.ndarray, face: np.ndarray,
-                          weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-    """Compute the atlas coordinates of the samples of cells that show one face each.
-
-    Args:
-        M: matrices of the faces, see `View`, float32, shape (faces, 3, 3).
-        affine: (sx, ox, sy, oy) of each cell's atlas level, shape (n, 4).
-        corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
-        cells, face: the cells to draw and the face that each shows, shapes (n,).
-        weights: of the corners at the samples, float32, shape (4, samples).
-        x, y: filled with the coordinates [texel], float32, shape (n, samples).
-    """
-    sx, ox, sy, oy = affine.T[..., None]
-    m = M[face]
-    to_atlas = np.stack([sx * m[:, 0] + ox * m[:, 2], sy * m[:, 1] + oy * m[:, 2], m[:, 2]], axis=1)
-    q = np.matmul(to_atlas, corners[cells]).transpose(1, 0, 2)  # (3, cells, 4)
-    u, v, inverse = np.ascontiguousarray(q) @ weights
-    np.divide(u, inverse, out=x)
-    np.divide(v, inverse, out=y)
-
-
-def nearer_samples_numpy(m: np.ndarray, half: np.ndarray, affine: np.ndarray, corners: np.ndarray, cells: np.ndarray,
-                         rows: np.ndarray, weights: np.ndarray, nearest: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-    """Assign to one face the samples in which it is in front of the faces processed so far.
-
-    Args:
-        m: matrix of the face, see `View`, float32, shape (3, 3).
-        half: its half extents [m], infinite where it is not bounded, float32, shape (2,).
-        affine: (sx, ox, sy, oy) of the atlas level in each row, shape (r, 4).
-        corners: rays of the corners of all cells, float32, shape (cells, 3, 4).
-        cells: the cells to draw, shape (n,).
-        rows: indices into `cells` of those in which the face may be visible, shape (r,).
-        weights: of the corners at the samples, float32, shape (4, samples).
-        nearest, x, y: inverse range [1/m] and atlas coordinates [texel] of the front face, float32, shape (n, samples);
-            changed where this face is in front.
-    """
-    u, v, inverse = np.ascontiguousarray(np.matmul(m, corners[cells[rows]]).transpose(1, 0, 2)) @ weights
-    before = nearest[rows]
-    wins = inverse > before
-    if np.isfinite(half[0]):
-        wins &= (np.abs(u) <= half[0] * inverse) & (np.abs(v) <= half[1] * inverse)
-    sx, ox, sy, oy = affine.T[..., None]
-    np.copyto(before, inverse, where=wins)
-    range_ = 1.0 / before  # of this face where it wins; elsewhere the value is not used
-    x[rows] = np.where(wins, sx * (u * range_) + ox, x[rows])
-    y[rows] = np.where(wins, sy * (v * range_) + oy, y[rows])
-    nearest[rows] = before
-
-
-classify = _classify if COMPILED else classify_numpy
-affine_of_cells = _affine_of_cells if COMPILED else affine_of_cells_numpy
-faces_behind = _faces_behind if COMPILED else faces_behind_numpy
-place_texels = _place_texels if COMPILED else place_texels_numpy
-uniform_samples = _uniform_samples if COMPILED else uniform_samples_numpy
-nearer_samples = _nearer_samples if COMPILED else nearer_samples_numpy
