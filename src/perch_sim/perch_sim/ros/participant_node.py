@@ -30,7 +30,7 @@ from rclpy.clock import Clock, ClockType
 CONNECT_PERIOD = 0.1   # between attempts to connect to the vehicle [s]
 CHECK_PERIOD = 0.005   # between checks whether an unfinished batch can continue [s]
 REQUEST_PERIOD = 0.5   # between checks of open requests [s]
-POLL_TIMEOUT = 0.05    # wait for a batch before other events are processed [s]
+POLL_TIMEOUT = 0.01    # wait for a batch before other events are processed [s]
 ANSWER_TIMEOUT = 50.0  # an answer this late was lost with its server: more than a plan may take, less than `lockstep_timeout` [s]
 WARN_AFTER = 3.0       # a vehicle that is missing, or a server that has not answered, for so long is reported [s]
 WARN_REPEAT = 10.0     # between reports of a missing vehicle [s]
