@@ -163,7 +163,7 @@ def compiled(kernel: Any = None, *, nogil: bool = False, inline: bool = False) -
 def load_cached(*packages: str) -> None:
     """Load the cached code of all kernels in the imported modules of some packages: a first call would load it, in 5 to 20 ms."""
     for kernel in tuple(_Compiled.kernels):
-        if kernel.py_func.__module__.partition(".")[0] in packages:
+        if (kernel.py_func.__module__ or "").partition(".")[0] in packages:  # code that is executed may have no module
             kernel.load_cached()
 
 
