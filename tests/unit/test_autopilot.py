@@ -371,7 +371,7 @@ def test_rotors_are_reported_to_stand_only_while_it_is_disarmed_and_no_command_h
         polled(node, start + 0.5, 100, **armed)
         return [(report.speed, report.thrust) for report in reports]
 
-    standing = [((0.0,) * 4, (0.0,) * 4)] * 10
+    standing = [((0.0,) * 4, (0.0,) * 4)] * 3
     assert reported(1.0) == standing
     assert reported(3.0, thrust=9.81) == []              # it may arm at any moment
     assert not obeyed(node, False) and reported(5.0) == standing
@@ -380,8 +380,11 @@ def test_rotors_are_reported_to_stand_only_while_it_is_disarmed_and_no_command_h
     monkeypatch.setattr(StubAutopilot, "armed", False)
     assert reported(9.0) == standing
     monkeypatch.setattr(StubAutopilot, "silent", True)
-    reported(11.0)
-    assert reported(12.5) == []
+    assert reported(11.0) == []
+    monkeypatch.setattr(StubAutopilot, "silent", False)  # its pilot has armed it meanwhile; samples come before its state
+    monkeypatch.setattr(StubAutopilot, "armed", True)
+    polled(node, 13.0, 100)
+    assert reports == []
 
 
 def test_a_clock_that_jumps_is_one_line_and_everything_goes_on(flown_on):

@@ -10,6 +10,7 @@ import signal
 import socket
 import struct
 import termios
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -211,6 +212,23 @@ def test_a_link_that_is_opened_again_finds_an_autopilot_whose_name_has_another_a
                     time.sleep(0.01)
         after.accept()[0].close()
         link.close()
+
+
+def test_a_link_is_opened_again_where_no_thread_can_be_made_to_resolve_its_name(monkeypatch):
+    """The supervisor, which commands a descent, would end in flight."""
+    def refused(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp:127.0.0.1:{server.getsockname()[1]}"
+        Link(address).close()
+        with monkeypatch.context() as without_threads:
+            without_threads.setattr(threading.Thread, "start", refused)
+            Link(address).close()
+        started = []
+        monkeypatch.setattr(threading.Thread, "start", lambda thread: started.append(thread))
+        Link(address).close()
+        assert len(started) == 1  # the name is looked up when threads can be made again
 
 
 @pytest.fixture(params=["serial", "tcp"])

@@ -149,7 +149,6 @@ class Betaflight(Component[BetaflightParameters]):
         requests = msp.request(msp.RAW_IMU)
         if self._polls % 10 == 0:
             requests += msp.request(_SLOW_REQUESTS[self._polls // 10 % len(_SLOW_REQUESTS)])
-            self._report_standing_rotors(now)
         elif self._arming.in_doubt:
             requests += msp.request(msp.STATUS)
         self._link.request(requests)
@@ -187,6 +186,8 @@ class Betaflight(Component[BetaflightParameters]):
             elif frame.command == msp.STATUS:
                 self._status = msp.status(frame)
                 self._check_arming(self._status, now)
+                if not self._status.armed and not self._arming.wanted:
+                    self.rotors(RotorState(now, (0.0,) * 4, (0.0,) * 4))  # they stand
             elif frame.command == msp.ATTITUDE:
                 self._attitude = msp.attitude(frame)
             elif frame.command == msp.ANALOG:
@@ -194,11 +195,6 @@ class Betaflight(Component[BetaflightParameters]):
                 self._update_battery(self._battery.voltage)
         except msp.MspError as error:
             self.warn(str(error), min_interval=1.0)
-
-    def _report_standing_rotors(self, now: int) -> None:
-        """Report that the rotors stand while the autopilot answers, is disarmed, and no command has the motors on."""
-        if self._status is not None and not self._status.armed and not self._arming.wanted and now - self._last_answer <= NANOSECONDS:
-            self.rotors(RotorState(now, (0.0,) * 4, (0.0,) * 4))
 
     def _update_battery(self, voltage: float) -> None:
         if self._sticks.battery.reference:

@@ -142,7 +142,10 @@ def _connected(address: str, host: str, port: int) -> tuple[socket.socket, socke
         if address in _peers:
             if address not in _resolving:
                 _resolving.add(address)
-                threading.Thread(target=_resolve, args=(address, host, port), daemon=True).start()
+                try:
+                    threading.Thread(target=_resolve, args=(address, host, port), daemon=True).start()
+                except RuntimeError:  # no thread can be made now: the address stays as it is
+                    _resolving.discard(address)
             connection = _connecting(*_peers[address])
         else:
             connection = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT)

@@ -114,8 +114,8 @@ class Emitter(Generic[V]):
 class Timer(_Port):
     """Periodic call of `on_<name>(now)` with a time [ns] that does not jump where a clock is set, also while no input arrives.
 
-    This time may differ from that of the stamps: compare it only with itself. Where it is that of a wall clock, it is when the
-    call was due, at a multiple of the period; a late call does not shift those that follow.
+    This time may differ from that of the stamps: compare it only with itself. Where it is not simulation time, it is when the call
+    was due, at a multiple of the period; a late call does not shift those that follow.
     """
 
     def __init__(self, period: float, stamping: bool = False) -> None:

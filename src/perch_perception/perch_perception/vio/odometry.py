@@ -149,7 +149,7 @@ class VisualInertialOdometry:
     @property
     def _rotors_stand(self) -> bool | None:
         """Whether the rotors stand; None: not known."""
-        return None if self._imu.last is None else rotors_stand(self._rotors, self._imu.last.stamp)
+        return rotors_stand(self._rotors, self._imu.newest.stamp)
 
     def add_image(self, stamp: int, image: np.ndarray) -> VioResult:
         """Process a frame.
