@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 import rclpy
@@ -208,14 +209,18 @@ def test_a_node_of_a_process_in_which_others_speak_is_not_called_silent(mission,
     assert events == [f"/vio {SILENT}"]
 
 
-def test_time_that_stands_still_for_long_ends_the_flight_and_names_who_owes(mission, pilot):
+def test_time_that_stands_still_for_long_ends_the_flight_and_names_who_owes(mission, pilot, monkeypatch):
     mission.passes.set()
     hear_who_owes(pilot)
     threading.Thread(target=lambda: (mission.begins.wait(120.0), mission.passes.clear()), daemon=True).start()
 
-    def hurry():
-        pilot._last_clock -= 0.0 if mission.passes.is_set() else 100.0  # every check is later than the one before
+    ahead, monotonic = 0.0, time.monotonic
 
+    def hurry():
+        nonlocal ahead
+        ahead += 0.0 if mission.passes.is_set() else 100.0  # every check is later than the one before
+
+    monkeypatch.setattr(client_module, "time", SimpleNamespace(monotonic=lambda: monotonic() + ahead))
     with pytest.raises(PerchError, match=r"stopped at .* waiting for estimator: odometry of 1.200 s"):
         pilot.fly(SCENARIO, check=hurry, stall_timeout=1000.0)
 
@@ -248,6 +253,19 @@ def test_ctrl_c_ends_the_wait(mission, pilot):
     threading.Thread(target=lambda: (mission.begins.wait(120.0), os.kill(os.getpid(), signal.SIGINT)), daemon=True).start()
     with pytest.raises(KeyboardInterrupt):
         pilot.fly(SCENARIO)
+
+
+def test_time_that_went_on_while_nobody_listened_counts_at_once_when_a_goal_is_sent(mission, pilot):
+    """The clock's jump is plausible for the time since its last message, not for that since the goal."""
+    mission.finish.set()
+    pilot.time, pilot._last_clock = 1.0, time.monotonic() - 100.0
+
+    def hear():
+        if mission.begins.is_set():
+            pilot._receive_clock(topics.topic("/clock").to_message(2_000_000_000_000))
+
+    assert pilot.fly(dataclasses.replace(SCENARIO, time_limit=1e4), check=hear).outcome == "perched"
+    assert pilot.time == 2000.0
 
 
 def test_a_foreign_clock_does_not_move_time(mission, pilot):

@@ -12,13 +12,15 @@ from perch_core.errors import ConfigError
 from perch_core.ros import topics
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.values import (
-    AttitudeThrust, ImuSample, MappedPowerline, MotorCommand, OdometryState, PerchGoal, PowerlineMap, RatesThrust, TrajectoryOrder, limits)
+    AttitudeThrust, ImuSample, MappedPowerline, MotorCommand, OdometryState, PerchGoal, PowerlineMap, RatesThrust, RotorState, TrajectoryOrder,
+    limits)
 from perch_eval.limits_page import page
 
 ROOT = Path(__file__).resolve().parents[2]
 IMU = ImuSample(0, (0.1, 0.2, 0.3), (0.0, 0.0, 9.81))
 ODOMETRY = OdometryState(0, (0.0,) * 3, (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, np.eye(6), np.eye(6))
 MOTORS = MotorCommand(0, True, (900.0,) * 4)
+ROTORS = RotorState(0, (0.0,) * 4, (0.0,) * 4)
 LINE = MappedPowerline(1, (0.0, 0.0, 3.0), (1.0, 0.0, 3.0), 0.01, np.eye(3), 0.1, 5)
 UNEVEN = np.eye(3) + np.triu(np.ones((3, 3)), 1)
 
@@ -35,6 +37,7 @@ UNEVEN = np.eye(3) + np.triu(np.ones((3, 3)), 1)
     (PerchGoal(takeoff_height=0.1), "takeoff_height: 0.1 is outside [0.3, 10] m"), (PerchGoal(attempts=10**6), "attempts: 1e+06 is outside"),
     (MOTORS, ""), (MOTORS._replace(rotor_speed=(0.0, 0.0, 0.0, -1.0)), "rotor_speed: -1 is outside [0, 10000] rad/s"),
     (MOTORS._replace(rotor_speed=(900.0,) * 3), "rotor_speed: shape (3,) is not 4"),
+    (ROTORS, ""), (ROTORS._replace(speed=(0.0, 0.0, nan, 0.0)), "speed: nan is not finite"), (ROTORS._replace(speed=()), "speed: shape (0,) is not 4"),
     ("a value without limits", "")])
 def test_a_value_is_refused_with_field_value_and_range(value, said):
     assert limits.problem(value).startswith(said) and bool(limits.problem(value)) == bool(said)

@@ -51,7 +51,7 @@ class Topic:
         qos: of publishers and subscribers.
         to_message: value to message.
         to_value: message to value, or to a list of values; raises PerchError for a message that cannot be converted.
-        observed: for observers only; no component in flight waits for it.
+        observed: no component in flight waits for it.
         size_max: greatest size of a message that is read [bytes].
         rate_max: greatest number of messages per second that a node reads; 0: no limit.
         packed: `to_message` returns the serialised message and `to_value` reads it, without rclpy's objects, for topics at 500 Hz.

@@ -73,7 +73,7 @@ class MissionClient(GraphNode):
         self._vehicle = self.node.get_namespace().rstrip("/") + "/vehicle"
         self.time, self._last_check = 0.0, 0.0
         self._waits: dict[str, str] = {}  # node -> what it waits for, by its newest diagnostics
-        self._last_clock = time.monotonic()  # when time advanced last, or a goal was sent [s]
+        self._last_clock = time.monotonic()  # when time advanced last [s]
         self._last_message: dict[str, float] = {}  # node -> when its diagnostics came last, monotonic clock [s]
         self.processes: dict[str, str] = {}
         self._silent: set[str] = set()
@@ -135,8 +135,7 @@ class MissionClient(GraphNode):
                 offered = partial(self.node.count_services, self.node.resolve_service_name(service))
                 self._spin_until(offered, check, START_TIMEOUT, f"{node} does not offer {service}")
         servers, explained = self._servers(), math.nan  # simulation time whose standing still was explained [s]
-        began = self._last_clock = time.monotonic()
-        start = self.time
+        began, start = time.monotonic(), self.time
         sent = self._client.send_goal_async(goal_message(goal_of(scenario)), feedback_callback=feedback)
 
         def answered() -> bool:
@@ -157,7 +156,7 @@ class MissionClient(GraphNode):
             self._check_graph(servers, scenario.nodes)
             if start == 0.0 < self.time:  # it begins
                 began, start = time.monotonic(), self.time
-            stopped = time.monotonic() - self._last_clock
+            stopped = time.monotonic() - max(self._last_clock, began)
             if stopped > EXPLAIN_AFTER and explained != self.time:
                 explained = self.time
                 on_phase(self.time, "waiting", f"simulation time has stopped: {self._waiting_text()}")
