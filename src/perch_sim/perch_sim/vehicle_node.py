@@ -7,5 +7,5 @@ with quiet_on_interrupt():
     from perch_sim.simulated_vehicle import SimulatedVehicle
 
 NODE = NodeSpec("vehicle", SimulatedVehicle, deadline="imu", lockstep="perch_sim.ros.vehicle_node:VehicleNode",
-            real_time="perch_sim.ros.vehicle_node:RealTimeVehicleNode")
+                real_time="perch_sim.ros.vehicle_node:RealTimeVehicleNode")
 create, main = NODE.create, NODE.main

@@ -14,7 +14,7 @@ class WaysOut:
     """Start times of the ways out of one plan.
 
     Attributes:
-        covered: start of the last one that was answered [s]; the next one begins `spacing` later.
+        covered: start of the last one that was answered [s]; the next one begins at least `spacing` later, or at `until`.
         until: start of the last one [s], unless it is nearer than `SPACING_MIN` to the one before.
         spacing: least time between the others [s].
         last: start of the latest one that was found [s].

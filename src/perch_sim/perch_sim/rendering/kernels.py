@@ -1,8 +1,8 @@
 """The renderer's inner loops over cells and samples, compiled.
 
 In numpy each arithmetic operation is a pass over all samples of all cells; compiled, a sample is computed in registers, and
-without the interpreter lock, so that rendering threads of one process do not block each other. A test
-compares the loops with plain numpy (tests/oracles/renderer.py).
+without the interpreter lock, so that rendering threads of one process do not block each other. A test compares the loops with
+plain numpy (tests/oracles/renderer.py).
 """
 
 from __future__ import annotations
