@@ -116,6 +116,7 @@ def test_a_stop_before_a_surface_keeps_the_room_that_the_body_needs(delay, befor
     ended = State.DISARMED if command is Command.LAND else State.HOVERING
     loop.run(5.5, until=lambda x: nearest.append((x.plant.p - plan.contact) @ plan.normal) or x.controller.state is State.DISARMED)
     assert loop.controller.state is ended and min(nearest) > room and loop.plant.impact_speed < 1.0
+    assert ended is State.DISARMED or np.linalg.norm(loop.plant.v) < 0.05
 
 
 def test_a_landing_leaves_a_trajectory_by_its_planned_way_out():
