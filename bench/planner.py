@@ -1,4 +1,4 @@
-"""Speed bars of the perching planner as it is shipped: plans with certificates, the OSQP path, wrong verdicts."""
+"""Speed bars of the perching planner as it is shipped: plans with certificates, wrong verdicts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from importlib.util import find_spec
 
 import exact_sturm
@@ -134,10 +133,6 @@ def figures(quick: bool) -> list[Figure]:
             times, failed = _rotorpy_times(waypoints, count)
             out += [figure(f"RotorPy's MinSnap, {waypoints} waypoints, no limit of thrust", "ms", times),
                     figure(f"RotorPy's MinSnap, {waypoints} waypoints: not solved of {count}", "problems", [failed])]
-    _print_step("plans with OSQP")
-    for waypoints in (0, 3):
-        times, _, _ = _plan_times(waypoints, replace(shipped, solver="osqp"), count // 10)
-        out.append(figure(f"plan with OSQP, {waypoints} waypoints", "ms", times))
     out.append(figure("ten million additions in plain Python, CPU time: the machine's speed", "s", [_additions()]))
     _print_step("first plans of a process")
     imported, first = _first_plan(fresh=False)

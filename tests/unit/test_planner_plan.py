@@ -10,13 +10,13 @@ from perch_core.errors import ConfigError
 from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import GRAVITY, load_vehicle
-from perch_planner import refusals, relaxation, search, solvers
+from perch_planner import refusals, relaxation, search
 from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint, contact_heading
 from perch_planner.refusals import PerchRefusal
 from perch_planner.plan_output import requirements
 from perch_planner.verifier import verify
-from random_perches import random_problem, shipped_settings
+from random_perches import paper_like_problem, random_problem, shipped_settings
 
 VEHICLE = load_vehicle("snapdragon")
 HOVER = StartState((0.0, 0.0, 1.5))
@@ -163,10 +163,23 @@ def test_moving_pads_are_met_where_they_are(inclination, velocity):
 
 
 @pytest.mark.parametrize("options", [
-    {"objective": "jerk"}, {"solver": "osqp"}, {"objective": "jerk", "solver": "osqp"}, {"rotor_margin": 0.01}, {"minimum_time": True}])
+    {"objective": "jerk"}, {"rotor_margin": 0.01}, {"minimum_time": True}])
 def test_every_option_gives_plans_that_verify(options):
     points = (Waypoint((0.5, 0.1, 1.5)), Waypoint((0.9, 0.0, 1.5)))
     checked(PerchProblem(HOVER, surface(60.0), points), PerchSettings(**options))
+
+
+@pytest.mark.parametrize("seed", [8, 15, 34, 58])
+def test_no_program_that_has_a_solution_ends_the_search_at_its_durations(seed):
+    planned = plan(paper_like_problem(np.random.default_rng(seed), 10), shipped_settings(), VEHICLE)
+    assert len({attempt.duration for attempt in planned.attempts}) == 1
+
+
+@pytest.mark.parametrize("seed", [98, 235, 334, 351])
+def test_durations_whose_plans_recur_are_given_up(seed):
+    """As the linearised bounds of the rotors then recur, too."""
+    planned = plan(paper_like_problem(np.random.default_rng(seed), 10), shipped_settings(), VEHICLE)
+    assert planned.iterations < 25
 
 
 def test_minimum_time_is_shorter_and_still_verifies():
@@ -395,8 +408,14 @@ def test_a_rotor_margin_above_zero_is_reduced_to_zero_at_most_where_this_suffice
 
 @pytest.mark.parametrize("seed", [20010, 20063])
 def test_a_refusal_solves_a_bounded_number_of_programs_and_names_limits_that_were_tried(seed, monkeypatch):
-    solved, least_norm = [], solvers.least_norm
-    monkeypatch.setattr(solvers, "least_norm", lambda *arguments: solved.append(1) or least_norm(*arguments))
+    solved, solve = [], search.solve
+
+    def counted(*arguments):
+        answer = solve(*arguments)
+        solved.extend(answer[0])
+        return answer
+
+    monkeypatch.setattr(search, "solve", counted)
     problem = random_problem(np.random.default_rng(seed))
     with pytest.raises(PerchRefusal) as caught:
         plan(problem, PerchSettings(), VEHICLE)

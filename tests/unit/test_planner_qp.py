@@ -8,13 +8,14 @@ from perch_core import bernstein
 from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
-from perch_planner import plan_checks, reduced_qp, reference_element, segment_program, solvers
+from perch_planner import plan_checks, reduced_qp, reference_element, segment_program
+from perch_planner.active_set import least_norm
 from perch_planner.contact_constraints import Contact, conditions, tube_bounds, tube_times
 from perch_planner.cutting import limit_cuts
 from perch_planner.linear_bounds import Bounds
 from perch_planner.paper import paper_m
 from perch_planner.problem import PerchProblem, PerchSettings, StartState, Waypoint
-from perch_planner.reduced_rows import rows_of, stacked
+from perch_planner.reduced_rows import rows_of
 from perch_planner.yaw_profile import yaw_coefficients
 
 VEHICLE = load_vehicle("snapdragon")
@@ -64,9 +65,9 @@ def program(contact: Contact, durations: np.ndarray, order: int = 4, everywhere:
     return made, rows_of(made, bounds), given, values
 
 
-def solved(made, rows, solver: str = "daqp") -> np.ndarray:
-    solution = solvers.least_norm(*rows, solver)
-    assert solution.solved, (solver, solution.status, solution.residual)
+def solved(made, rows) -> np.ndarray:
+    solution = least_norm(*rows)
+    assert solution.solved
     return reduced_qp.coefficients(made, solution.w)
 
 
@@ -79,7 +80,7 @@ def test_reduced_and_full_form_agree(objective, order, waypoints, durations):
     contact = Contact(asked, settings, VEHICLE.perch_offset)
     same, default = (solved(*program(contact, durations, order, everywhere)[:2]) for everywhere in (True, False))
     chosen = paper_m.position_program(asked, settings, VEHICLE, durations)
-    full = chosen.coefficients(solvers.least_norm(chosen.rows, chosen.lower, chosen.upper).w)
+    full = chosen.coefficients(least_norm(chosen.rows, chosen.lower, chosen.upper).w)
     assert same == pytest.approx(full, abs=1e-4)
     assert cost(same, durations, order) == pytest.approx(cost(full, durations, order), rel=1e-6)
     # Without the bubbles before the tube the fourth derivative is continuous at a small price.
@@ -87,10 +88,19 @@ def test_reduced_and_full_form_agree(objective, order, waypoints, durations):
         assert 1.0 - 1e-6 <= cost(default, durations, order) / cost(full, durations, order) <= 1.001
 
 
-def test_solvers_find_the_same_minimum():
+def test_two_libraries_find_the_same_minimum():
+    import daqp
+    import osqp
+    from scipy import sparse
+
     made, rows, _, _ = program(Contact(problem(80.0), PerchSettings(), VEHICLE.perch_offset), np.array([1.2, 0.5]))
-    assert set(solvers.SOLVERS) == {"daqp", "osqp"}
-    assert solved(made, rows, "osqp") == pytest.approx(solved(made, rows, "daqp"), abs=1e-5)
+    matrix, lower, upper = rows
+    peer, n = osqp.OSQP(), matrix.shape[1]
+    peer.setup(sparse.identity(n, format="csc"), np.zeros(n), sparse.csc_matrix(matrix), lower, upper, verbose=False, eps_abs=1e-8, eps_rel=1e-8,
+               max_iter=20000, polishing=True, scaling=0)
+    own = solved(made, rows)
+    assert own == pytest.approx(reduced_qp.coefficients(made, np.asarray(peer.solve().x)), abs=1e-5)
+    assert own == pytest.approx(reduced_qp.coefficients(made, daqp.solve(None, None, *rows[:1], upper, lower, np.zeros(len(lower), np.int32))[0]), abs=1e-9)
 
 
 def test_a_program_that_starts_at_the_multipliers_of_another_has_the_same_minimum():
@@ -100,12 +110,12 @@ def test_a_program_that_starts_at_the_multipliers_of_another_has_the_same_minimu
         rows = rng.normal(size=(30, 12))
         rows /= np.linalg.norm(rows, axis=1)[:, None]
         lower = rng.uniform(-1.0, 0.4, 30)
-        cold = solvers.least_norm(rows, lower, lower + 1.5)
-        warm = solvers.least_norm(rows, lower, lower + 1.5, dual=rng.normal(size=30) * (rng.random(30) < 0.3))
+        cold = least_norm(rows, lower, lower + 1.5)
+        warm = least_norm(rows, lower, lower + 1.5, dual=rng.normal(size=30) * (rng.random(30) < 0.3))
         assert warm.solved == cold.solved
         if cold.solved:
             assert np.abs(warm.w - cold.w).max() < 1e-9
-            again = solvers.least_norm(rows, lower, lower + 1.5, dual=cold.dual)
+            again = least_norm(rows, lower, lower + 1.5, dual=cold.dual)
             assert np.array_equal(np.sign(again.dual), np.sign(cold.dual)) and cold.dual.any()
             solvable += 1
     assert 20 < solvable < 50, "both kinds are met"
@@ -123,16 +133,15 @@ def test_least_norm_is_the_minimum_that_scipy_finds():
     rows = rng.normal(size=(6, 8))
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     lower, upper = np.full(6, 0.1), np.full(6, 0.4)
-    answer = solvers.least_norm(rows, lower, upper)
+    answer = least_norm(rows, lower, upper)
     peer = minimize(lambda w: w @ w, np.ones(8), jac=lambda w: 2 * w, method="SLSQP", options={"ftol": 1e-14}, constraints=[
         {"type": "ineq", "fun": lambda w: rows @ w - lower}, {"type": "ineq", "fun": lambda w: upper - rows @ w}])
     assert answer.solved and answer.w @ answer.w == pytest.approx(peer.fun, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", solvers.SOLVERS)
-def test_contradictory_bounds_are_not_called_solved(name):
+def test_contradictory_bounds_are_not_called_solved():
     rows = np.array([[1.0, 0.0], [-1.0, 0.0]])
-    answer = solvers.least_norm(rows, np.array([1.0, 1.0]), np.array([2.0, 2.0]), name)
+    answer = least_norm(rows, np.array([1.0, 1.0]), np.array([2.0, 2.0]))
     assert not answer.solved
 
 
@@ -181,7 +190,7 @@ def test_cuts_hold_where_they_are_set_also_as_sums_of_derivatives():
     x, bound = np.array([1.0, 0.0, 0.0]), jerk - 2.0 * force - 1.0
     cut = Bounds(np.array([0, 0]), np.array([0, 0]), np.array([0.4, 0.4]), np.array([3, 2]), np.array([x, -2.0 * x]),
                  np.array([-np.inf]), np.array([bound]))
-    jerk, force = at(solved(made, stacked(rows, rows_of(made, tuple(cut)))))
+    jerk, force = at(solved(made, tuple(map(np.concatenate, zip(rows, rows_of(made, tuple(cut)))))))
     assert jerk - 2.0 * force <= bound + 1e-5
 
 

@@ -14,8 +14,8 @@ from perch_planner.linear_bounds import BoundArrays
 from perch_planner.problem import PerchProblem, PerchSettings
 
 INSET = 1e-7
-"""Tightening of the bounds [SI], more than the residual that solvers leave (1e-9 of a row's length with DAQP, 1e-8 with OSQP).
-`solvers.FEASIBILITY` permits a larger residual: the certificate of the impact speed is computed from the plan itself."""
+"""Tightening of the bounds [SI], more than the residual that usually remains (`active_set.TOLERANCE` of a row's length).
+`active_set.FEASIBILITY` permits a larger residual: the certificate of the impact speed is computed from the plan itself."""
 
 TUBE_STEP = 0.01    # dt of [M:eq15] [s]
 TUBE_SHARE = 0.1    # q of [M:eq15]

@@ -52,35 +52,6 @@ class PlanLimits(NamedTuple):
     waypoints: int
 
 
-class PlanCheck(NamedTuple):
-    """Result of the check of a plan.
-
-    Attributes:
-        coefficients: of the plan, shape (f, 3, 15) [m].
-        extrema: from `plan_checks.thrust_extrema`.
-        results: rows of `plan_checks.NAMES`, meaningless unless `checked`.
-        thrust_min, thrust_max: proved extrema of the specific thrust [m/s^2].
-        checked: the limits other than the thrust were checked.
-        rotors_hold: no violation of the rotor range was found, and its proof did not fail.
-        holds: all limits but the rotor range are proved; with `rotors_hold`, the rotor range too.
-        stretch: longer durations promise more than cuts, and no cuts were made.
-        cuts: number of linear bounds found, without those of the rotors.
-        rotor_bounds: their number; they are valid near the plan only.
-    """
-
-    coefficients: np.ndarray
-    extrema: np.ndarray
-    results: np.ndarray
-    thrust_min: float
-    thrust_max: float
-    checked: bool
-    rotors_hold: bool
-    holds: bool
-    stretch: bool
-    cuts: int
-    rotor_bounds: int
-
-
 @compiled
 def _prefer_stretch(extrema: Array, high: float, waypoints: int) -> bool:
     """Whether the thrust peak is to be lowered by longer durations rather than by cuts."""
@@ -105,9 +76,12 @@ def check_plan(coefficients: Array, yaw: Array, heading: Array, durations: Array
         after_first: this is not the first program: the other limits are also checked where the thrust is nearly in its range.
 
     Returns:
-        (extrema, results, (thrust_min, thrust_max, checked, rotors_hold, holds, stretch), thrust, other, thrusts): the first
-        three as in `PlanCheck`; thrust, other: cuts of the thrust and of the other limits, fields of `Bounds`; thrusts: from
-        `rotor_thrusts.sample_rotor_thrusts`, empty where the rotors were not checked.
+        (extrema, results, (thrust_min, thrust_max, checked, rotors_hold, holds, stretch), thrust, other, thrusts). extrema: from
+        `plan_checks.thrust_extrema`; results: rows of `plan_checks.NAMES`, meaningless unless `checked`; thrust_min, thrust_max: proved extrema of
+        the specific thrust [m/s^2]; checked: the limits other than the thrust were checked; rotors_hold: no violation of the rotor range was
+        found, and its proof did not fail; holds: all limits but the rotor range are proved, and with `rotors_hold` that, too; stretch: longer
+        durations promise more than cuts, and none were made; thrust, other: cuts of the thrust and of the other limits, fields of `Bounds`;
+        thrusts: from `rotor_thrusts.sample_rotor_thrusts`, empty where the rotors were not checked.
     """
     p_S, v_S, s3, turn_direction, low, high, speed, low_height, high_height, extension, clearance, offset, rate, small_violation, waypoints = plan_limits
     extrema, least, most = thrust_extrema(coefficients, durations, low, high)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from importlib.util import find_spec
 from math import atan2, hypot
 from typing import Any, NamedTuple
 
@@ -176,7 +175,6 @@ class PerchSettings(PerchParameters):
     body_rate_max: float = quantity(0.0, unit="rad/s", low=0.0, doc="bound on |omega|; 0: the vehicle's")
     objective: str = choice("snap", options=("snap", "jerk"), doc="cost of [M:eq4]")
     minimum_time: bool = quantity(False, doc="shorten the plan until a bound is active")
-    solver: str = choice("daqp" if find_spec("daqp") else "osqp", options=("daqp", "osqp"), doc="of the quadratic programs")
 
     def for_surface(self, surface: PerchSurface) -> PerchSettings:
         """Return the settings of a plan to a surface, with a raised `impact_acceleration` where the surface faces up.

@@ -83,6 +83,12 @@ def rows_of(program: ProgramArrays, bounds: BoundArrays) -> Rows:
 
 
 @compiled
-def stacked(above: Rows, below: Rows) -> Rows:
-    """Stack two sets of rows of one program."""
-    return (np.concatenate((above[0], below[0])), np.concatenate((above[1], below[1])), np.concatenate((above[2], below[2])))
+def put(rows: Rows, at: int, added: Rows) -> Rows:
+    """Write rows behind the first `at` ones; where there is no room, into a copy with twice the room that is needed."""
+    matrix, lower, upper = rows
+    end = at + len(added[1])
+    if end > len(lower):
+        matrix, lower, upper = np.empty((2 * end, matrix.shape[1])), np.empty(2 * end), np.empty(2 * end)
+        matrix[:at], lower[:at], upper[:at] = rows[0][:at], rows[1][:at], rows[2][:at]
+    matrix[at:end], lower[at:end], upper[at:end] = added[0], added[1], added[2]
+    return matrix, lower, upper

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +11,11 @@ import numpy as np
 from perch_core.vehicle import Vehicle
 from perch_planner.contact_constraints import Contact
 from perch_planner.cutting import turn_direction
-from perch_planner.plan_checks import BODY_RATE, HEIGHT, HOLDS, MAXIMUM, MINIMUM, SPEED
-from perch_planner.plan_evaluation import PlanCheck, PlanLimits
+from perch_planner.plan_evaluation import PlanLimits
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
+from perch_planner.reference_element import GRAMS
 from perch_planner.rotor_thrusts import rotor_model
-from perch_planner.segment_program import COST_ORDER, SegmentProgram
+from perch_planner.segment_program import COST_ORDER, VIOLATED, solve
 from perch_planner.time_allocation import (
     FINE_DIVISIONS, allocate, initial_durations, lengthen_approach, shortened, split_finely, split_last, stretch_factor, with_last_segment)
 from perch_planner.yaw_profile import yaw_coefficients
@@ -22,7 +23,7 @@ from perch_planner.yaw_profile import yaw_coefficients
 STARTS = ((1.0, 100), (1.25, 75), (0.8, 75), (0.55, 50), (0.45, 40))
 """First durations of a search, as factors of the problem's `segment_times`, then of the allocated ones, and most programs from each."""
 ITERATIONS_MAX = sum(programs for _, programs in STARTS)
-_CUT_ROUNDS = 24
+_PROGRAMS_PER_TRY = 25    # of one set of durations
 _EARLY_STRETCHES = 5      # so often, peaks are stretched where a longer time helps most: high ones, and those before the last waypoint
 _SMALL_VIOLATION = 0.03   # violations of the thrust range below this share are cut together with the other limits
 _DEFAULT_STRETCH = 1.15
@@ -119,56 +120,27 @@ class Search:
             durations: [s], shape (f,).
             allow_stretch: stop early where longer durations promise more than cuts.
         """
-        settings, start = self.settings, self.problem.start
-        no_plan = Outcome(durations)
-        yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations,
-                               COST_ORDER[settings.objective])
+        start, objective, mass = self.problem.start, self.settings.objective, self.vehicle.mass
+        order, duration = COST_ORDER[objective], float(durations.sum())
+        yaw = yaw_coefficients(start.yaw, start.yaw_rate, start.yaw_acc, self.end_yaw, durations, order)
+        programs_max = min(_PROGRAMS_PER_TRY, max(self._iterations_end - self.iterations, 1))
         try:
-            program = SegmentProgram(self.contact, durations, settings, yaw, self.plan_limits, self.rotors)
+            programs, violated, coefficients, extrema, results, (least, most, proved, stretch, cuts) = solve(
+                durations, yaw, self.contact.velocity, self.contact.problem, objective == "jerk", GRAMS[order], order, tuple(self.plan_limits),
+                self.rotors, allow_stretch, programs_max)
         except np.linalg.LinAlgError:
-            return no_plan
-        best, count, duration = None, 0, float(durations.sum())
-        for rounds in range(_CUT_ROUNDS + 1):
-            if rounds and self.iterations >= self._iterations_end:
-                break
-            check = program.solve_and_check(allow_stretch, rounds > 0)
-            if check is None:
-                self._record_attempt(duration, np.nan, np.nan, count)
-                break
-            self._record_attempt(duration, check.thrust_min, check.thrust_max, count)
-            if check.holds and check.rotors_hold:
-                return Outcome(durations, check.coefficients, yaw, check.results, True)
-            self._record_violations(check)
-            outcome = self._thrust_violation(durations, check)
-            if outcome and check.stretch:
-                return outcome
-            count += check.cuts + check.rotor_bounds
-            if check.checked and not outcome:
-                outcome = Outcome(durations, check.coefficients, yaw, check.results)
-            best = outcome
-            if not (check.cuts or program.rotor_limits_active):
-                break
+            return Outcome(durations)
+        self.attempts += [Attempt(duration, mass * low, mass * high, int(count)) for low, high, count in programs.tolist()]
+        self.active_limits.update(compress(VIOLATED, violated.tolist()))
+        if not len(coefficients):
+            return Outcome(durations)
+        if self.low <= least and most <= self.high:
+            return Outcome(durations, coefficients, yaw, results, proved)
         # After cuts the peak does not predict that of a longer plan: the next one is only a little longer.
-        return best._replace(stretch=_DEFAULT_STRETCH) if best and count else best or no_plan
-
-    def _thrust_violation(self, durations: np.ndarray, check: PlanCheck) -> Outcome | None:
-        """Return the outcome where the thrust leaves its range, else None."""
-        if check.thrust_max <= self.high and check.thrust_min >= self.low:
-            return None
-        return Outcome(durations, check.coefficients, stretch=stretch_factor(check.thrust_max, self.high), extrema=check.extrema)
-
-    def _record_attempt(self, duration: float, least: float, most: float, cuts: int) -> None:
-        mass = self.vehicle.mass
-        self.attempts.append(Attempt(duration, mass * least, mass * most, cuts))
-
-    def _record_violations(self, check: PlanCheck) -> None:
-        """Record which limits a plan violates."""
-        violated = {"thrust_min": check.thrust_min < self.low, "thrust_max": check.thrust_max > self.high, "rotor_margin": not check.rotors_hold}
-        if check.checked:
-            results, (floor, ceiling) = check.results, self.limits.height
-            violated |= {"speed_max": not results[SPEED, HOLDS], "body_rate_max": not results[BODY_RATE, HOLDS],
-                         "height_min": results[HEIGHT, MINIMUM] < floor, "height_max": results[HEIGHT, MAXIMUM] > ceiling}
-        self.active_limits |= {name for name, is_violated in violated.items() if is_violated}
+        factor = stretch_factor(most, self.high)
+        if cuts:
+            factor = min(factor, _DEFAULT_STRETCH) if stretch else _DEFAULT_STRETCH
+        return Outcome(durations, coefficients, stretch=factor, extrema=extrema)
 
     def run(self) -> Found:
         """Search from each of the first durations in `STARTS` until every limit is proved.

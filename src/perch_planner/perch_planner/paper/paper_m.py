@@ -28,10 +28,10 @@ from perch_core import bernstein
 from perch_core.errors import ConfigError
 from perch_core.trajectory import FlatTrajectory
 from perch_core.vehicle import GRAVITY, Vehicle
+from perch_planner.active_set import least_norm
 from perch_planner.contact_constraints import TUBE_FLOOR, TUBE_SHARE, TUBE_STEP
 from perch_planner.paper import sturm
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, contact_heading
-from perch_planner.solvers import least_norm
 
 N = 14            # order of the polynomials [M:eq3]
 SMOOTH = 4        # continuous up to this derivative [M:eq7]
@@ -241,7 +241,7 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pa
 
     Args:
         problem: with `segment_times`, the initial durations, and a static target.
-        settings: alpha, v_min, v_max, tube, thrust bounds, objective, solver and `duration_max`; others are ignored.
+        settings: alpha, v_min, v_max, tube, thrust bounds, objective and `duration_max`; others are ignored.
         vehicle: mass, thrust range and perch offset.
 
     Raises:
@@ -255,7 +255,7 @@ def plan(problem: PerchProblem, settings: PerchSettings, vehicle: Vehicle) -> Pa
     done: list[Any] = []
     while not solved and durations.sum() <= settings.duration_max and len(done) < PROGRAMS_MAX:
         chosen = position_program(problem, settings, vehicle, durations)
-        solution = least_norm(chosen.rows, chosen.lower, chosen.upper, settings.solver)
+        solution = least_norm(chosen.rows, chosen.lower, chosen.upper)
         coefficients, violated = None, np.ones(len(durations), bool)
         if solution.solved:
             coefficients = chosen.coefficients(solution.w)
