@@ -18,9 +18,8 @@ from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
 from perch_eval.evaluation import command, control, inspection, kept, planning_times
 from perch_eval.evaluation.cable import cable_of_length, cable_sections
-from perch_eval.evaluation.nonlinear import solve
-from perch_eval.evaluation.planning_times import SETTINGS, waypoint_problem
-from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.evaluation.planning_times import SETTINGS, solve, waypoint_problem
+from perch_eval.evaluation.document import Effort, Section
 from perch_planner.paper import paper_m
 
 

@@ -9,10 +9,9 @@ from perch_core import so3
 from perch_core.trajectory import SampledTrajectory
 from perch_core.values import AtEnd, Contact, MappedPowerline, PowerlineMap, TrajectoryOrder, nanoseconds
 from perch_eval.campaign.results import RunResult
-from perch_eval.evaluation import kept, powerline, powerline_flights
-from perch_eval.evaluation.powerline import POSITION, flown_sections
-from perch_eval.evaluation.powerline_flights import hovers_at_end, mapping_errors, perching_errors
-from perch_eval.evaluation.sections import FAILS, HOLDS, SHOWN, VACUOUS, Effort
+from perch_eval.evaluation import kept, powerline
+from perch_eval.evaluation.document import FAILS, HOLDS, SHOWN, VACUOUS, Effort
+from perch_eval.evaluation.powerline import POSITION, flown_sections, hovers_at_end, mapping_errors, perching_errors
 from perch_eval.flight import Flight, States
 from perch_eval.revision import digest
 from perch_sim.scenario import Cable, Mission, Scenario, World
@@ -121,11 +120,11 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
             yield task, asdict(RunResult(task.run.number, task.run.seed, "perched", "perched", "", task.run.values))
 
     monkeypatch.setattr(kept, "in_processes", pool)
-    found = powerline_flights.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"))
+    found = powerline.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"))
     assert {key: [r.seed for r in runs] for key, runs in found.items()} == {
         ("line_80_pa", True): [1, 2], ("line_80_pa", False): [], ("line_180", True): [1, 2], ("line_180", False): [1, 2]}
     assert all(task.scenario.get("grip", {}).get("enabled", True) == task.run.values["grips"] for task in handed)
-    found = powerline_flights.flights(effort(tmp_path, 5), ("line_80_pa", "line_180"))
+    found = powerline.flights(effort(tmp_path, 5), ("line_80_pa", "line_180"))
     assert [r.seed for r in found["line_180", False]] == [1, 2, 3] and [r.seed for r in found["line_180", True]] == [1, 2, 3, 4, 5]
     assert len(handed) == len({task.run.number for task in handed}) == 13, "nothing is flown twice"
 

@@ -11,7 +11,7 @@ from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_eval.campaign.results import RunResult
 from perch_eval.evaluation import control, inspection, perching, powerline, ways_out
-from perch_eval.evaluation.sections import Effort
+from perch_eval.evaluation.document import Effort
 from perch_eval.inspection.measures import inspection_result, judge, reference_states, segments, watched
 from perch_sim.scenario import load_scenario
 

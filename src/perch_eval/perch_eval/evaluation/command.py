@@ -13,7 +13,7 @@ from pathlib import Path
 from perch_core.registry import resolved
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.evaluation import document
-from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Section
+from perch_eval.evaluation.document import FAILS, MISSING, Effort, Section
 from perch_eval.revision import OtherCodeError
 
 EXAMPLES = """examples:

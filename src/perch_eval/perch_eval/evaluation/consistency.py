@@ -16,7 +16,7 @@ from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.workers import in_processes
 from perch_eval.consistency import Consistency
 from perch_eval.estimation_flight import EstimatorTrack
-from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.evaluation.document import Effort, Section
 from perch_eval.target_sightings import Sightings, localize_target
 from perch_sim.scenario import load_scenario
 

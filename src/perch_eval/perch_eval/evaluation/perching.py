@@ -20,7 +20,7 @@ from perch_eval.campaign.engines import Task
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
 from perch_eval.evaluation.kept import cached_runs
-from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.evaluation.document import Effort, Section
 from perch_eval.flight_view import FlightView
 from perch_eval.in_process import Sensing, fly
 from perch_eval.statistics import Rate, Spread
