@@ -62,7 +62,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         "simulated_time_s": end_time, "simulated_duration_s": end_time - start_time, "wall_time_s": wall_time,
         "real_time_factor": (end_time - start_time) / wall_time if wall_time > 0 else math.nan,
         **flight_metrics(flight, end_time),
-        "flight_hash": flight.digest(end_time), "margins": [one.mapping() for one in margins(flight, vehicle, scenario)],
+        "flight_hash": flight.digest(end_time), "margins": margins(flight, vehicle, scenario),
         "rates_hz": rates(flight), "timings_ms": node_durations(flight),
         "missed_deadlines": missed_deadlines(flight), "recording_damage": flight.damage,
     }
