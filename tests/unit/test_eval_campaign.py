@@ -129,7 +129,7 @@ vary:
     scenario = config.from_mapping(Scenario, campaign.mapping(run), "c")
     assert scenario.target.distance == run.values["target.distance"]
     assert scenario.wind.steady == (0.0, run.values["wind.steady.1"], 0.0)
-    assert scenario.parameters["controller"]["gains.lead"] == run.values["parameters.controller.gains.lead"]
+    assert config.flattened(scenario.parameters["controller"])["gains.lead"] == run.values["parameters.controller.gains.lead"]
     for k in range(3):  # each point is flown under the same draws
         same = campaign.runs[4 * k:4 * k + 4]
         assert len({(r.seed, r.values["wind.steady.1"], r.values["parameters.controller.gains.lead"]) for r in same}) == 1

@@ -101,7 +101,7 @@ def cells_of(values: Sequence[Any]) -> tuple[list[str], np.ndarray]:
     distinct = sorted(set(keys), key=lambda key: (isinstance(key, str), key))
     if len(distinct) <= 10 or isinstance(distinct[-1], str):
         return [key if isinstance(key, str) else f"{key:.4g}" for key in distinct], np.array([distinct.index(key) for key in keys])
-    edges = np.linspace(distinct[0], distinct[-1], BINS + 1)
+    edges = np.linspace(float(distinct[0]), float(distinct[-1]), BINS + 1)
     return ([f"{low:.3g} - {high:.3g}" for low, high in zip(edges, edges[1:])],
             np.clip(np.searchsorted(edges, keys, side="right") - 1, 0, BINS - 1))
 

@@ -6,7 +6,6 @@ A varied name is a field of the scenario (`target.distance`, `wind.gust_sigma`),
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import itertools
 import json
@@ -119,10 +118,11 @@ class Campaign:
 
     def mapping(self, run: Run) -> dict[str, Any]:
         """Return the scenario's mapping for a run, in the form of a scenario file."""
-        out = copy.deepcopy(self.base)
+        flat = config.flattened(self.base)
         for name, value in run.values.items():
-            set_value(out, name, config.beside(self.file, value) if name in FILES["scenarios"] else value)
-        return out
+            name, value = _field(flat, name, config.beside(self.file, value) if name in FILES["scenarios"] else value)
+            flat[name] = list(value) if isinstance(value, tuple) else value
+        return config.nested(flat)
 
 
 def load_campaign(path: Path | str, engine: str | None = None, runs: int | None = None) -> Campaign:
@@ -185,41 +185,17 @@ def _check(campaign: Campaign, file: str) -> list[dict[str, Any]]:
     return [extended_mapping("vehicles", vehicle) | {"board": config.read_yaml(config.find("boards", board))} for vehicle, board, _ in vehicles]
 
 
-def set_value(mapping: dict[str, Any], name: str, value: Any) -> None:
-    """Set a dotted name in a scenario's mapping; a number as last part is an index into a vector."""
-    *groups, leaf = name.split(".")
-    value = list(value) if isinstance(value, tuple) else value
-    if groups[:1] == ["parameters"] and len(groups) >= 2:
-        _group(mapping, groups[:2])[".".join((*groups[2:], leaf))] = value
-    elif groups and leaf.isascii() and leaf.isdigit():
-        *outer, vector = groups
-        target = _group(mapping, outer)
-        entries = target.get(vector, _default(groups))
-        if not isinstance(entries, list):
-            raise ConfigError("campaign", f"vary.{name}", f"{vector} is not a vector")
-        if int(leaf) >= len(entries):
-            raise ConfigError("campaign", f"vary.{name}", f"{vector} has {len(entries)} entries")
-        target[vector] = [*entries[:int(leaf)], value, *entries[int(leaf) + 1:]]
-    else:
-        _group(mapping, groups)[leaf] = value
-
-
-def _default(groups: list[str]) -> Any:
-    """Return the default value of a scenario's field, vectors as lists."""
-    value: Any = Scenario(name="defaults")
-    for group in groups:
-        value = getattr(value, group, None)
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _group(mapping: dict[str, Any], groups: list[str]) -> dict[str, Any]:
-    for group in groups:
-        if mapping.get(group) is None:
-            mapping[group] = {}
-        mapping = mapping[group]
-        if not isinstance(mapping, dict):
-            raise ConfigError("campaign", f"vary.{'.'.join(groups)}", f"{group} is a value, not a group")
-    return mapping
+def _field(flat: Mapping[str, Any], name: str, value: Any) -> tuple[str, Any]:
+    """Return name and value of the field of a scenario, given by dotted names, that a varied name sets: itself, or the vector of an entry."""
+    vector, _, index = name.rpartition(".")
+    if not (index.isascii() and index.isdigit()) or name.startswith("parameters."):
+        return name, value
+    entries = flat.get(vector, config.flattened(asdict(Scenario(name="defaults"))).get(vector))
+    if not isinstance(entries, list):
+        raise ConfigError("campaign", f"vary.{name}", f"{vector.rpartition('.')[2]} is not a vector")
+    if int(index) >= len(entries):
+        raise ConfigError("campaign", f"vary.{name}", f"{vector.rpartition('.')[2]} has {len(entries)} entries")
+    return vector, [*entries[:int(index)], value, *entries[int(index) + 1:]]
 
 
 def _draw(vary: Mapping[str, Distribution], runs: int, seed: int) -> tuple[Run, ...]:
