@@ -198,7 +198,7 @@ def test_parts_have_their_places_on_the_page_whatever_order_they_are_asked_for_i
     assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("[")] == ["[1/2] a", "[2/2] c"]
 
 
-@pytest.mark.parametrize("arguments", [["--jobs", "0"], ["--seeds", "-1"], ["--line-seeds", "many"], ["--quick", "--full"]])
+@pytest.mark.parametrize("arguments", [["--jobs", "0"], ["--seeds", "-1"], ["--line-seeds", "many"]])
 def test_wrong_arguments_are_invalid_input(arguments):
     with pytest.raises(SystemExit) as end:
         command.main(arguments)
