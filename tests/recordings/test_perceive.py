@@ -14,10 +14,9 @@ from perch_core.sensors import load_sensors
 from perch_core.values import ImuSample
 from perch_eval.flight import timed
 from perch_eval.recordings import command
-from perch_eval.recordings.asl import AslRecording
-from perch_eval.recordings.bag import BagRecording, _topic
 from perch_eval.recordings.command import _unused
-from perch_eval.recordings.recording import RecordingError
+from perch_eval.recordings.opening import BagRecording, _topic
+from perch_eval.recordings.recording import AslRecording, RecordingError
 from perch_eval.recordings.trajectory import read_trajectory, read_truth
 from recordings import photo_flight
 from unit.recorded_flights import flown, record
