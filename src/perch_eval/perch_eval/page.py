@@ -77,7 +77,7 @@ def in_words(key: str, value: float) -> tuple[str, str]:
 
 
 def figure_rows(figures: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Return figures, also those in mappings, as rows of a table: finite numbers, and texts that are not empty, also several of one key."""
+    """Return figures, also those in mappings, as rows of a table: finite numbers, and texts (one or a list) that are not empty."""
     rows: list[tuple[str, str]] = []
     for key, value in figures.items():
         name = f"{prefix}{key}"

@@ -139,7 +139,8 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
     file = config.find("campaigns", path)
     content = config.load(_File, file)
     base = extended_mapping("scenarios", config.beside(file, content.scenario))
-    vary = {name: (parse_seed if name == "seed" else parse_distribution)(str(file), f"vary.{name}", entry) for name, entry in (content.vary or {}).items()}
+    vary = {name: (parse_seed if name == "seed" else parse_distribution)(str(file), f"vary.{name}", entry)
+            for name, entry in (content.vary or {}).items()}
     mappable = [name for name in vary if name != "seed"]  # one run a seed: no rate
     for axis in content.map:
         if axis not in mappable:
@@ -186,7 +187,7 @@ def _check(campaign: Campaign, file: str) -> list[dict[str, Any]]:
 
 
 def _field(flat: Mapping[str, Any], name: str, value: Any) -> tuple[str, Any]:
-    """Return name and value of the field of a scenario, given by dotted names, that a varied name sets: itself, or the vector of an entry."""
+    """Return name and value of the scenario field that a varied name sets: itself, or the vector of an entry. `flat`: dotted names."""
     vector, _, index = name.rpartition(".")
     if not (index.isascii() and index.isdigit()) or name.startswith("parameters."):
         return name, value

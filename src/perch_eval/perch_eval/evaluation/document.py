@@ -1,4 +1,4 @@
-"""Results of an evaluation: sections of rows beside the paper's values, each with a verdict, and figures; written as Markdown and JSON."""
+"""Results of an evaluation: sections of rows beside the paper's values, each with a verdict, and figures; their pages and JSON."""
 
 from __future__ import annotations
 
