@@ -159,7 +159,7 @@ def test_interrupt_keeps_what_is_finished_and_says_how_to_go_on(campaign, tmp_pa
             time.sleep(0.05)
 
 
-def test_runs_that_break_are_results_and_do_not_mix_with_those_of_other_settings(campaign, tmp_path, capsys):
+def test_runs_that_break_are_results_and_do_not_mix_with_those_of_other_settings(campaign, undrawn, tmp_path, capsys):
     assert call(campaign("broken", 12, "--jobs", "1"), capsys)[0] == 1
     found = read_results(tmp_path / "out" / "results.jsonl")[1]
     assert [r.number for r in found if r.cause == "error"] == [0, 4, 8]
