@@ -79,6 +79,13 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 
 
 @pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages and pictures are made without drawing their figures, each of which takes a third of a second."""
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+    monkeypatch.setattr("matplotlib.backends.backend_agg.FigureCanvasAgg.print_png", lambda *_, **__: None)
+
+
+@pytest.fixture
 def executor(ros_domain):
     """Of the nodes of a test, in a domain of their own; they are closed after it."""
     import rclpy

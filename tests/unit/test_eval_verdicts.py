@@ -97,7 +97,7 @@ def test_refusals_that_differ_in_the_interval_found_are_one_line(effort, monkeyp
 
 
 @pytest.mark.slow
-def test_an_inspection_that_is_given_up_has_not_avoided_the_lines(effort, monkeypatch):
+def test_an_inspection_that_is_given_up_has_not_avoided_the_lines(effort, undrawn, monkeypatch):
     scenario = load_scenario("inspection")
     times, states = reference_states(scenario)
     still = inspection_result(scenario, times[:50], np.repeat(states[:1], 50, axis=0), 0, "the controller has landed")
