@@ -46,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
     out = command_parser("evaluate.py", __doc__, EXAMPLES)
     size = out.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="both papers, with few flights (default)")
-    size.add_argument("--full", action="store_true", help="every part, with many flights; resumable, but for c_consistency")
+    size.add_argument("--full", action="store_true", help="every part, with many flights; resumable")
     out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
     out.add_argument("--out", type=Path, metavar="DIR", help="folder of page, figures and JSON, replaced at the end (default: docs/results with --full and "
                                                               "without --only, otherwise out/results)")
@@ -114,5 +114,4 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
     return sections
 
 
-main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, except those of c_consistency: the same command "
-                                                "(without --fresh) continues")
+main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept: the same command (without --fresh) continues")
