@@ -10,10 +10,10 @@ import numpy as np
 import perception_lines
 import perception_tags
 from harness import Figure, figure, measure
-from perch_eval import estimation_flight
+from open_loop import flight as open_loop
 from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.workers import in_processes
-from perch_eval.perch_motion import PerchMotion, read_imu
+from open_loop.motion import PerchMotion, read_imu
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import Estimator, ImuSample, Inertial, VioPose
 from perch_perception.ukf.odometry import vio_state
@@ -62,15 +62,15 @@ def _fly(task: tuple[str, int]) -> _FlightErrors:
     """Run VIO and UKF on one rendered perch."""
     cv2.setNumThreads(1)
     scenario = load_scenario(task[0])
-    flight, begin = estimation_flight.fly(scenario, task[1]), estimation_flight.motion_of(scenario, task[1]).perch_time
-    steps = estimation_flight.run_vio(flight)
-    late = estimation_flight.run_estimator(flight, steps, latency=LATENCY)
-    prompt = estimation_flight.run_estimator(flight, steps, latency=0.0)
+    flight, begin = open_loop.fly(scenario, task[1]), open_loop.motion_of(scenario, task[1]).perch_time
+    steps = open_loop.run_vio(flight)
+    late = open_loop.run_estimator(flight, steps, latency=LATENCY)
+    prompt = open_loop.run_estimator(flight, steps, latency=0.0)
     return _FlightErrors([1e3 * s.cost for s in steps], 100 * _rmse(late, begin), float(np.degrees(np.linalg.norm(late.errors[-1, 6:9]))),
                   float(_rmse(late, begin).mean() / _rmse(prompt, begin).mean()))
 
 
-def _rmse(track: estimation_flight.EstimatorTrack, begin: float) -> np.ndarray:
+def _rmse(track: open_loop.EstimatorTrack, begin: float) -> np.ndarray:
     return np.sqrt((track.errors[track.times >= begin, :3] ** 2).mean(axis=0))
 
 

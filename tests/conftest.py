@@ -34,7 +34,8 @@ settings.register_profile(
 settings.load_profile("perch")
 
 TAKES_TIME = re.compile(
-    r"^\s*(?:from|import) (?:closed_loop|oracles|perch_eval(?:\.| import )(?:control_flights|estimation_flight|in_process|program|ros|scripted_flight|stack)|"
+    r"^\s*(?:from|import) (?:closed_loop|open_loop(?:\.| import )flight|oracles|"
+    r"perch_eval(?:\.| import )(?:control_flights|in_process|program|ros|scripted_flight|stack)|"
     r"perch_core\.isolated|perch_sim\.(?:rendering|simulation)|psutil|rclpy|subprocess|system)\b", re.MULTILINE)
 """Imports of test files that fly, draw or start something."""
 

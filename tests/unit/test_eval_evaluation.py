@@ -153,7 +153,7 @@ def test_an_interrupted_evaluation_leaves_pages_and_figures_as_they_were(parts, 
     for interrupts, code, content in ((True, 130, ["old", "old", "old"]), (False, 0, ["new", "# Res", "old"])):
         assert command.main(["--out", "results"]) == code
         assert [Path("results", name).read_text()[:5] for name in ("figure.png", "README.md", "notes.txt")] == content
-    assert "finished flights are kept, except those of c_consistency" in capsys.readouterr().err
+    assert "finished flights are kept: the same command" in capsys.readouterr().err
     assert {file.name for file in Path("results").iterdir()} == {"figure.png", "README.md", "notes.txt", "results.json"}
 
 

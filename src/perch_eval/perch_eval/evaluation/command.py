@@ -44,7 +44,7 @@ BEYOND_PAPERS = ("c_faults", "c_comparison", "c_way_out", "c_contact", "c_consis
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     out = command_parser("evaluate.py", __doc__, EXAMPLES)
-    out.add_argument("--full", action="store_true", help="every part, with many flights; resumable, but for c_consistency")
+    out.add_argument("--full", action="store_true", help="every part, with many flights; resumable")
     out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
     out.add_argument("--out", type=Path, metavar="DIR", help="folder of page, figures and JSON, replaced at the end (default: docs/results with --full and "
                                                               "without --only, otherwise out/results)")
@@ -112,5 +112,4 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
     return sections
 
 
-main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, except those of c_consistency: the same command "
-                                                "(without --fresh) continues")
+main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept: the same command (without --fresh) continues")

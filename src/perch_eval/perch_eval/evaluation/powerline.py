@@ -19,7 +19,7 @@ from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task, fly_in_process
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
-from perch_eval.control_flights.aborted import MAX_HOVER_SPEED
+from perch_eval.ending import MAX_HOVER_SPEED
 from perch_eval.evaluation.document import Effort, Section
 from perch_eval.evaluation.kept import cached_runs
 from perch_eval.flight import Flight
