@@ -59,17 +59,18 @@ class ArrivalNode(ComponentNode):
         handler = partial(self.guarded, port.name, port.handler(self.component))
 
         def call() -> None:
-            self._intake.enter(handler, self.host_time() if port.stamping else self._due_time(timer))
+            self._intake.enter(handler, self.host_time() if port.stamping else self._due_time(timer, period))
 
         timer: RosTimer = self.create_timer(port.period, call, clock=self._steady)
+        period = timer.timer_period_ns
 
-    def _due_time(self, timer: RosTimer) -> int:
-        """Return simulation time once it is received; otherwise when a timer's present call was due [ns].
+    def _due_time(self, timer: RosTimer, period: int) -> int:
+        """Return simulation time once it is received; otherwise when the present call of a timer with this period was due [ns].
 
         The latter is a monotonic time, which goes on where the system's clock is set.
         """
         simulated = self.host_time() if cast(ROSClock, self.get_clock()).ros_time_is_active else 0
-        return simulated or time.monotonic_ns() + self._steady_offset + timer.time_until_next_call() - timer.timer_period_ns
+        return simulated or time.monotonic_ns() + self._steady_offset + timer.time_until_next_call() - period
 
     def _warn_foreign_publishers(self) -> None:
         """Warn once of each foreign publisher on a topic that a neighbour publishes: its messages are ignored."""
