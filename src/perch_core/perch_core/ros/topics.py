@@ -54,7 +54,7 @@ class Topic:
         observed: no component in flight waits for it.
         size_max: greatest size of a message that is read [bytes].
         rate_max: greatest number of messages per second that a node reads; 0: no limit.
-        packed: `to_message` returns the serialised message and `to_value` reads it, without rclpy's objects, for topics at 500 Hz.
+        packed: `to_message` returns the serialised message and `to_value` reads it, without rclpy's objects: 500 Hz topics and images.
         """
 
     channel: str
@@ -84,6 +84,11 @@ class Topic:
         return self.to_value(message)
 
     @property
+    def frequent(self) -> bool:
+        """Whether it has a message with every IMU sample."""
+        return self.packed and self.message is not Image
+
+    @property
     def latched(self) -> bool:
         """Whether late subscribers receive messages that were published before."""
         return bool(self.qos.publish.durability == DurabilityPolicy.TRANSIENT_LOCAL)
@@ -91,11 +96,11 @@ class Topic:
 
 TOPICS = (
     Topic("imu/data_raw", Imu, qos.SENSOR, fast.pack_imu, fast.unpack_imu, packed=True),
-    Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.image_message, sensing.image_value, size_max=IMAGE_MAX, rate_max=300),
+    Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.pack_image, sensing.unpack_image, packed=True, size_max=IMAGE_MAX, rate_max=300),
     Topic("camera_*/image_raw/compressed", CompressedImage, qos.IMAGE, sensing.compressed_message, sensing.compressed_value, size_max=IMAGE_MAX,
           rate_max=300),
     Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value, rate_max=300),
-    Topic("vio/debug_image", Image, qos.IMAGE, sensing.image_message, sensing.image_value, size_max=IMAGE_MAX),
+    Topic("vio/debug_image", Image, qos.IMAGE, sensing.pack_image, sensing.unpack_image, packed=True, size_max=IMAGE_MAX),
     Topic("vio/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
     Topic("vio/state", VioState, qos.SENSOR, states.inertial_message, states.inertial_value),
     Topic("odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
