@@ -23,6 +23,7 @@ _BATCH, _PACKET = struct.Struct("<qI"), struct.Struct("<HI")  # stamp [ns] and n
 _PEER = struct.Struct("3i")                                   # process, user, group
 _SEND_LIMIT = struct.pack("ll", 0, 20_000)                    # longest wait for a participant that does not read [s, us]
 _RECEIVE_LIMIT = struct.pack("ll", 10, 0)                     # ... and for the rest of a message that has begun [s, us]
+_SEND_BUFFER = 1 << 20                                       # holds an image, so that the vehicle does not wait for its reader [B]
 _LENGTH = struct.Struct("!i")                                 # of a message, as in multiprocessing
 
 
@@ -114,6 +115,7 @@ class ParticipantListener:
             user = _PEER.unpack(peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
             peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_LIMIT)
             peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_LIMIT)
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # as far as net.core.wmem_max permits
             connection = Connection(peer.detach())
             try:
                 if user != os.getuid() or not connection.poll(1.0):
