@@ -1,9 +1,10 @@
 """Serialisation of messages with a fixed layout, without rclpy's objects.
 
 rclpy creates a Python object for every field: it reads an `Odometry` in 380 us and writes one in 40 us, at 500 Hz more than its
-processing; of an image it makes five copies. `Layout` reads and writes such messages by one `struct` for each combination of text lengths; the layout is derived
-from the message definition. The format is OMG CDR (XCDR1, little endian), which every ROS 2 middleware uses: 4 bytes of
-encapsulation, then the fields in order, each aligned to its size, counted from the end of the encapsulation.
+processing; an image is copied several times. `Layout` reads and writes such messages by one `struct` for each combination of text
+lengths; the layout is derived from the message definition. The format is OMG CDR (XCDR1, little endian), which every ROS 2
+middleware uses: 4 bytes of encapsulation, then the fields in order, each aligned to its size, counted from the end of the
+encapsulation.
 """
 
 from __future__ import annotations
@@ -26,12 +27,13 @@ _CODES = {"boolean": "?", "octet": "B", "uint8": "B", "int8": "b", "uint16": "H"
 
 
 class Layout:
-    """Layout of one message type. Its content is flat: numbers and texts in order, each run of doubles as its bytes, final bytes."""
+    """Layout of one message type. Its content is flat: numbers and texts in order, each run of doubles as its bytes, and final bytes."""
 
     def __init__(self, message: type) -> None:
         """
         Args:
-            message: type that consists of numbers, texts, arrays of fixed length and messages of these; it may end with a sequence of bytes.
+            message: type that consists of numbers, texts, arrays of fixed length and messages of these; it may end with a sequence
+                of bytes.
 
         Raises:
             TypeError: it has other fields of variable length.

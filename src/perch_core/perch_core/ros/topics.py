@@ -54,7 +54,7 @@ class Topic:
         observed: no component in flight waits for it.
         size_max: greatest size of a message that is read [bytes].
         rate_max: greatest number of messages per second that a node reads; 0: no limit.
-        packed: `to_message` returns the serialised message and `to_value` reads it, without rclpy's objects: 500 Hz topics and images.
+        packed: `to_message` returns the serialised message and `to_value` reads it, without rclpy's objects: frequent topics and images.
         """
 
     channel: str
@@ -85,7 +85,7 @@ class Topic:
 
     @property
     def frequent(self) -> bool:
-        """Whether it has a message with every IMU sample."""
+        """Whether its messages are so many that one wake-up of a reader serves several."""
         return self.packed and self.message is not Image
 
     @property
@@ -116,7 +116,7 @@ TOPICS = (
     Topic("motor_command", MotorCommand, qos.SENSOR, fast.pack_motor, fast.unpack_motor, packed=True),
     Topic("rates_thrust_command", RatesThrust, qos.SENSOR, fast.pack_rates, fast.unpack_rates, packed=True),
     Topic("attitude_thrust_command", AttitudeThrust, qos.SENSOR, fast.pack_attitude, fast.unpack_attitude, packed=True),
-    Topic("rotor_state", RotorState, qos.SENSOR, states.rotors_message, states.rotors_value, observed=True),
+    Topic("rotor_state", RotorState, qos.SENSOR, fast.pack_rotors, fast.unpack_rotors, packed=True, observed=True),
     Topic("contact", Contact, qos.EVENT, states.contact_message, states.contact_value),
     Topic("ground_truth/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True, observed=True),
     Topic("ground_truth/target", PoseStamped, qos.LATCHED, states.pose_message, states.pose_value),
