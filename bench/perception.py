@@ -11,9 +11,9 @@ import perception_lines
 import perception_tags
 from harness import Figure, figure, measure
 from open_loop import flight as open_loop
+from open_loop.motion import PerchMotion, read_imu
 from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.workers import in_processes
-from open_loop.motion import PerchMotion, read_imu
 from perch_core.vehicle import load_vehicle
 from perch_perception.ukf import Estimator, ImuSample, Inertial, VioPose
 from perch_perception.ukf.odometry import vio_state
