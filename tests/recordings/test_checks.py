@@ -240,6 +240,16 @@ def test_stamps_that_are_none_fail():
     assert any("does not stamp" in finding.text for finding in report.findings)
 
 
+@pytest.mark.parametrize("late, level", [(20_000_000, "ok"), (-5_000_000, "warning"), (600_000_000, "warning")])
+def test_how_long_after_their_stamps_images_were_recorded_is_said(late, level):
+    report, statistics = Report(), checks.ImageStatistics(20)
+    for stamp in range(0, 2_000_000_000, 100_000_000):
+        statistics.add(CameraImage(stamp, "c", 64, 48, "mono8", np.zeros((48, 64), np.uint8)), stamp + late)
+    checks.check_camera(report, "cam0", statistics, 5_000_000 * np.arange(400), None)
+    delay = next(finding for finding in report.findings if finding.about == "camera cam0 delay")
+    assert (delay.level, f"recorded {late // 1_000_000} ms after" in delay.text) == (level, True)
+
+
 # -- against the truth -----------------------------------------------------------------------------------------------
 
 

@@ -42,7 +42,7 @@ def check(recording: Recording, events: Iterator[Event] | None = None) -> Report
             stamps.append(event.value.stamp)
             samples.append((*event.value.w_B, *event.value.f_B))
         else:
-            cameras[event.source].add(event.value)
+            cameras[event.source].add(event.value, event.arrived)
     if recording.damage:
         report.add("recording", recording.damage, warning=True)
     if not stamps:
@@ -72,18 +72,21 @@ class ImageStatistics:
     """Collects stamps and sampled image properties of a camera."""
     def __init__(self, total: int) -> None:
         self.stamps: list[int] = []
+        self.delays: list[int] = []
         self.sizes: set[tuple[int, int]] = set()
         self.samples: list[tuple[float, ...]] = []
         self._every = max(1, total // SAMPLED_IMAGES)
 
-    def add(self, image: CameraImage) -> None:
-        """Add an image."""
+    def add(self, image: CameraImage, arrived: int | None = None) -> None:
+        """Add an image and the time of its recording [ns], if that is known."""
         if len(self.stamps) % self._every == 0:
             pixels = image.pixels()
             if pixels is not None:
                 self.sizes.add((pixels.shape[1], pixels.shape[0]))
                 self.samples.append(measure_image(pixels))
         self.stamps.append(image.stamp)
+        if arrived is not None:
+            self.delays.append(arrived - image.stamp)
 
 
 def measure_image(pixels: np.ndarray) -> tuple[float, ...]:
@@ -126,6 +129,10 @@ def check_camera(report: Report, name: str, statistics: ImageStatistics, imu_sta
             gap = 1e-9 * max(imu_stamps[0] - stamps[0], stamps[-1] - imu_stamps[-1])
             report.add(f"{about} clock", f"{100 * outside:.0f} % of the images lie outside the IMU's time, by up to {gap:.3f} s",
                        warning=outside < 0.5, fails=outside >= 0.5)
+    if len(imu_stamps) and statistics.delays:
+        median, p99 = np.percentile(statistics.delays, (50, 99)) * 1e-6
+        report.add(f"{about} delay", f"recorded {median:.0f} ms after the stamp (median; 99 % within {p99:.0f} ms)",
+                   warning=bool(median < -1.0 or p99 > 500.0))
     brightness, bright, width, corners = (np.array(column) for column in zip(*statistics.samples))
     report.figures[f"{name}_corners"] = float(np.median(corners))
     report.add(f"{about} exposure",

@@ -109,7 +109,7 @@ class BagRecording(Recording):
             messages = reader.messages([c for c in reader.connections if c.topic in sources])
             while True:
                 try:
-                    connection, _, data = next(messages)
+                    connection, arrived, data = next(messages)
                     value = self._value(sources[connection.topic], connection, reader.deserialize(data, connection.msgtype))
                 except StopIteration:
                     break
@@ -119,7 +119,7 @@ class BagRecording(Recording):
                 except Exception as error:  # whatever the libraries make of a damaged file
                     self.damage = f"{type(error).__name__}: {error}"
                     break
-                yield Event(sources[connection.topic], value)
+                yield Event(sources[connection.topic], value, arrived)
         texts = [f"{n} of {self._counts[topic]} messages of {topic} cannot be used: {error}" for (topic, error), n in unusable.most_common(1)]
         self.damage = "; ".join(filter(None, [*texts, self.damage]))
 

@@ -41,10 +41,12 @@ class Event(NamedTuple):
     Attributes:
         source: `imu`, or the name of the camera.
         value: sample or image, in the sensor's own axes.
+        arrived: time of recording [ns]; None: unknown.
     """
 
     source: str
     value: ImuSample | CameraImage
+    arrived: int | None = None
 
 
 class Recording(ABC):
