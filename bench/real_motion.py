@@ -15,10 +15,10 @@ from typing import Any
 import cv2
 import numpy as np
 from perch_core.vehicle import GRAVITY
-from perch_eval import estimation_flight
+from open_loop import flight as open_loop
 from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.workers import in_processes
-from perch_eval.perch_motion import Motion
+from open_loop.motion import Motion
 from perch_perception.vio import FrameOutcome
 from perch_sim.rendering import build_scene
 from perch_sim.scenario import load_scenario
@@ -82,8 +82,8 @@ def fly(job: tuple[Path, float, int]) -> dict[str, float]:
     world = replace(scenario.world, room=(float(size[0]), float(size[1]), float(motion.high[2]) + BESIDE),
                     room_centre=tuple((0.5 * (motion.low + motion.high))[:2].tolist()))
     scene = replace(build_scene(replace(scenario, world=world), seed), target=None, board=None)
-    flight = estimation_flight.sensor_data(motion, scene, scenario, seed)
-    steps = estimation_flight.run_vio(flight, level_ground=False)
+    flight = open_loop.sensor_data(motion, scene, scenario, seed)
+    steps = open_loop.run_vio(flight, level_ground=False)
     posed = [(s.error[:3], s.result.estimate.pose_covariance[:3, :3]) for s in steps if s.error is not None and s.result.estimate is not None]
     return {"path_m": float(np.linalg.norm(np.diff(flight.truth.p_WB, axis=0), axis=1).sum()), "error_m": float(np.linalg.norm(posed[-1][0])),
             "nees": float(np.mean([e @ np.linalg.solve(P, e) for e, P in posed])) / 3.0,

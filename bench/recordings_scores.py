@@ -28,8 +28,7 @@ from perch_core.sensors import CalibrationSigmas
 from perch_core.tag_board import Tag, TagBoard, TagGrid, load_board
 from perch_eval.recordings import command
 from perch_eval.recordings.image_detections import ImageDetections, detect, find_tags, guessed_mount
-from perch_eval.recordings.opening import image_files
-from perch_eval.recordings.recording import decoded, picture
+from perch_eval.recordings.recording import decoded, image_files, picture
 from perch_perception.line_mapping import LineDetectionConfig
 from perch_perception.tags import BoardLocalizer
 from scipy.optimize import minimize

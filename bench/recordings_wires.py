@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from perch_core.camera import Camera
-from perch_eval.recordings.opening import image_files
+from perch_eval.recordings.recording import image_files
 from perch_perception.line_mapping import LineSighting
 from recordings_scores import Figures, detections_in
 from scipy.io import loadmat

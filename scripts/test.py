@@ -21,11 +21,16 @@ PARTS = (
     ("tests/system/test_flight_surface.py",), ("tests/system/test_two_vehicles.py", "tests/unit/test_goals_in_a_row.py"),
     ("tests/system/test_restart.py",), ("tests/nodes/",), ("tests/unit/test_autopilot_firmware.py",),
     ("tests/recordings/",), ("tests/system/test_bad_input.py",), ("tests/system/test_campaign.py",),
-    ("tests/fuzz/test_messages.py", "tests/fuzz/test_services.py"), ("tests/unit/test_types.py",), ("tests/unit/test_vio_component.py",),
+    ("tests/fuzz/test_messages.py", "tests/fuzz/test_services.py"), ("tests/unit/test_types.py",),
+    ("tests/system/test_scripts_graph.py", "tests/unit/test_autopilot_links.py", "tests/unit/test_autopilot_start.py",
+     "tests/unit/test_eval_mission_client.py"), ("tests/unit/test_vio_component.py",),
     ("tests/unit/test_vio_filter.py",), ("tests/unit/test_vio_images.py",), ("tests/unit/test_vio_rest.py",), ("tests/unit/test_control_nmpc.py",),
     ("tests/unit/test_eval_replay.py", "tests/unit/test_eval_compare.py"),
 )
-"""The longest parts, which start first; files and folders of one part share expensive fixtures. Each other file is a part."""
+"""The longest parts, which start first; each other file is a part.
+
+Files and folders of one part share expensive fixtures or, where they wait for clocks and processes, leave the cores to the other processes.
+"""
 PROCESSES = 1 + min(os.cpu_count() or 1, 5)
 """One more than cores (at most 6), as some tests wait for clocks or processes; with two more, real-time tests starve."""
 PYCACHE = ROOT / ".perch" / "pycache"

@@ -34,7 +34,8 @@ settings.register_profile(
 settings.load_profile("perch")
 
 TAKES_TIME = re.compile(
-    r"^\s*(?:from|import) (?:closed_loop|oracles|perch_eval(?:\.| import )(?:control_flights|estimation_flight|in_process|program|ros|scripted_flight|stack)|"
+    r"^\s*(?:from|import) (?:closed_loop|open_loop(?:\.| import )flight|oracles|"
+    r"perch_eval(?:\.| import )(?:control_flights|in_process|program|ros|scripted_flight|stack)|"
     r"perch_core\.isolated|perch_sim\.(?:rendering|simulation)|psutil|rclpy|subprocess|system)\b", re.MULTILINE)
 """Imports of test files that fly, draw or start something."""
 
@@ -76,6 +77,13 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     with reserved_domain() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         yield domain
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages and pictures are made without drawing their figures, each of which takes a third of a second."""
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+    monkeypatch.setattr("matplotlib.backends.backend_agg.FigureCanvasAgg.print_png", lambda *_, **__: None)
 
 
 @pytest.fixture

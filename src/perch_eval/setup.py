@@ -12,6 +12,7 @@ setup(
     maintainer_email="perch@users.noreply.github.com",
     license="Apache-2.0",
     packages=find_packages(exclude=["test", "test.*"]),
+    package_data={PACKAGE: ["*.js"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from closed_loop.plant import NoParameters
 from perch_core.component import Component, Input, Output
 from perch_core.values import EstimatorHealth, OdometryState
-from perch_eval.in_process.modelled_sight import NoParameters
 
 STATUS_PERIOD = 100_000_000  # [ns]
 RUNNING = 1

@@ -16,7 +16,7 @@ from perch_core.component import Action, Client, Component, Input, Output, Servi
 from perch_core.errors import PerchError
 from perch_core.values import CameraImage
 from perch_sim.lockstep import Answer, Arrival, LocalParticipant, Packet, PendingInput, Schedule, Task, local_servers
-from perch_sim.lockstep.link import ParticipantListener, address, pack, unpack
+from perch_sim.lockstep.link import NonBlockingSender, ParticipantListener, address, pack, receive, unpack
 from perch_sim.pacing import MAX_CATCH_UP, Pacing
 
 MS = 1_000_000
@@ -513,6 +513,38 @@ def test_a_participant_that_stops_within_a_message_is_not_waited_for(listener):
     reader.start()
     reader.join(2.0)
     assert name == "vio" and [type(error) for error in ended] == [BlockingIOError]
+
+
+def test_an_image_is_sent_at_once_to_a_participant_that_reads_it_later(listener):
+    vehicle, connect = listener
+    participant = connect(b'{"node": "vio", "inputs": []}')
+    [(_, _, connection)] = vehicle.accept()
+    sender = NonBlockingSender(connection)
+    sender.send(bytes(640 * 480))
+    assert not sender._unsent and participant.recv_bytes() == bytes(640 * 480)
+    sender.close()
+
+
+def test_a_message_is_read_whole_by_one_call_unless_it_is_large(listener, monkeypatch):
+    vehicle, connect = listener
+    participant, calls, read = connect(b'{"node": "vio", "inputs": []}'), [], os.read
+    [(_, _, connection)] = vehicle.accept()
+    monkeypatch.setattr("os.read", lambda *arguments: calls.append(1) or read(*arguments))
+    for size in (0, 1000):
+        participant.send_bytes(bytes(size))
+        assert receive(connection) == bytes(size)
+    assert len(calls) == 2
+    participant.send_bytes(bytes(100_000))
+    assert receive(connection) == bytes(100_000)
+    os.write(participant.fileno(), b"\0\0")
+    threading.Timer(0.01, os.write, (participant.fileno(), b"\0\3abc")).start()
+    assert receive(connection) == b"abc"
+    participant.send_bytes(b"one"), participant.send_bytes(b"two")
+    with pytest.raises(PerchError, match="more than one message"):
+        receive(connection)
+    participant.close()
+    with pytest.raises(EOFError):
+        receive(connection)
 
 
 @pytest.mark.parametrize("greeting", [b"", b"\xff", b"3", b"{}", b'{"node": "vio", "inputs": 3}', b"[" * 60_000])

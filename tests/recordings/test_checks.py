@@ -7,14 +7,13 @@ import pytest
 
 from perch_core.sensors import ImuSensor, load_sensors
 from perch_core.values import CameraImage
-from perch_eval.recordings import camera_check, sensors_command
+from perch_eval.recordings import check as checks
+from perch_eval.recordings import sensors_command
 from perch_eval.recordings.check import check
-from perch_eval.recordings.evaluation import evaluate
-from perch_eval.recordings.findings import Report, check_rate
-from perch_eval.recordings.imu_check import allan_deviation, check_estimated_biases, check_imu, stretches_at_rest
+from perch_eval.recordings.imu_check import Report, allan_deviation, check_estimated_biases, check_imu, check_rate, stretches_at_rest
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.recording import IMU, Recording, RecordingError
-from perch_eval.recordings.trajectory import Trajectory, read_trajectory, write_tum
+from perch_eval.recordings.trajectory import Trajectory, evaluate, read_trajectory, write_tum
 from recordings import photo_flight
 
 
@@ -41,8 +40,8 @@ class Told(Recording):
 @pytest.fixture(autouse=True)
 def few_looks(monkeypatch):
     """A dozen images and four seconds of turns are enough here."""
-    monkeypatch.setattr(camera_check, "SAMPLED_IMAGES", 12)
-    monkeypatch.setattr(camera_check, "SPAN", 4.0)
+    monkeypatch.setattr(checks, "SAMPLED_IMAGES", 12)
+    monkeypatch.setattr(checks, "SPAN", 4.0)
 
 
 def spoilt(heard, imu=lambda k, s: s, image=lambda k, i: i):
@@ -108,7 +107,7 @@ def test_clock_and_mounting_are_told_by_the_turns(late, R, size, level, words):
     begin = np.arange(10.0, 18.0, 0.05)
     seen = np.array([gyro[(t > b - 0.001) & (t < b + 0.051)].mean(axis=0) for b in begin]) @ R + 0.02 * rng.standard_normal((len(begin), 3))
     report = Report()
-    camera_check._check_clock(report, "cam0", np.column_stack([begin + late, begin + late + 0.05, seen]), t, gyro, 0.0)
+    checks._check_clock(report, "cam0", np.column_stack([begin + late, begin + late + 0.05, seen]), t, gyro, 0.0)
     found = {f.about: f for f in report.findings}
     assert found["camera cam0 clock"].level == level and words in found["camera cam0 clock"].text
     if late < 9.0 and size == 1.0:
@@ -125,7 +124,7 @@ def test_a_close_scene_changes_the_size_of_the_turns_and_no_more(factor, matches
     begin = np.arange(10.0, 18.0, 0.05)
     seen = np.array([gyro[(t > b - 0.001) & (t < b + 0.051)].mean(axis=0) for b in begin])
     report = Report()
-    camera_check._check_clock(report, "cam0", np.column_stack([begin, begin + 0.05, factor * seen + 0.25 * rng.standard_normal(seen.shape)]),
+    checks._check_clock(report, "cam0", np.column_stack([begin, begin + 0.05, factor * seen + 0.25 * rng.standard_normal(seen.shape)]),
                               t, gyro, 0.0)
     text = next(f.text for f in report.findings if f.about == "camera cam0 clock")
     assert ("does not match" not in text) == matches, text
@@ -133,7 +132,7 @@ def test_a_close_scene_changes_the_size_of_the_turns_and_no_more(factor, matches
 
 def test_translation_close_to_the_floor_widens_the_sigma_of_the_clock(heard, monkeypatch):
     """It looks like turns and shifts the estimate by 10 ms; neighbouring errors that are alike show it."""
-    monkeypatch.setattr(camera_check, "SPAN", 8.0)
+    monkeypatch.setattr(checks, "SPAN", 8.0)
     events, sensors = heard
     report = check(Told(events, sensors))
     text = next(f.text for f in report.findings if f.about == "camera cam0 clock")
@@ -234,11 +233,21 @@ def test_stamps_that_are_none_fail():
     assert findings(stamps // 1000, still)["imu rate"].level == "fails"
     assert "not judged" in findings(stamps // 20_000_000 * 20_000_000, still)["noise"].text
     report = Report()
-    statistics = camera_check.ImageStatistics(20)
+    statistics = checks.ImageStatistics(20)
     for _ in range(20):
-        statistics.add(CameraImage(0, "c", 64, 48, "mono8", np.zeros((48, 64), np.uint8)), 0)
-    camera_check.check_camera(report, "cam0", statistics, stamps, None)
+        statistics.add(CameraImage(0, "c", 64, 48, "mono8", np.zeros((48, 64), np.uint8)))
+    checks.check_camera(report, "cam0", statistics, stamps, None)
     assert any("does not stamp" in finding.text for finding in report.findings)
+
+
+@pytest.mark.parametrize("late, level", [(20_000_000, "ok"), (-5_000_000, "warning"), (600_000_000, "warning")])
+def test_how_long_after_their_stamps_images_were_recorded_is_said(late, level):
+    report, statistics = Report(), checks.ImageStatistics(20)
+    for stamp in range(0, 2_000_000_000, 100_000_000):
+        statistics.add(CameraImage(stamp, "c", 64, 48, "mono8", np.zeros((48, 64), np.uint8)), stamp + late)
+    checks.check_camera(report, "cam0", statistics, 5_000_000 * np.arange(400), None)
+    delay = next(finding for finding in report.findings if finding.about == "camera cam0 delay")
+    assert (delay.level, f"recorded {late // 1_000_000} ms after" in delay.text) == (level, True)
 
 
 # -- against the truth -----------------------------------------------------------------------------------------------
@@ -271,7 +280,7 @@ def test_nees_is_three_for_errors_as_large_as_they_are_said_to_be():
     noise = sigma * rng.standard_normal((len(truth), 3))
     noise[0] = 0.0
     e = evaluate(Trajectory(truth.stamps, truth.p + noise, truth.q), truth, np.tile(np.diag(sigma**2), (len(truth), 1, 1)))
-    assert 2.6 < np.nanmean(e.nees) < 3.4  # 1197 degrees of freedom: 3 +- 0.12 (1 sigma)
+    assert 2.6 < e.figures["nees_position_mean"] < 3.4  # 1197 degrees of freedom: 3 +- 0.12 (1 sigma)
 
 
 def test_a_path_too_straight_to_align_attitudes_by_says_nothing_of_them():

@@ -13,11 +13,10 @@ from scipy.spatial.transform import Rotation
 from perch_core.sensors import load_sensors
 from perch_core.values import ImuSample
 from perch_eval.flight import timed
-from perch_eval.recordings import command
-from perch_eval.recordings.asl import AslRecording
-from perch_eval.recordings.bag import BagRecording, _topic
+from perch_eval.recordings import check, command
 from perch_eval.recordings.command import _unused
-from perch_eval.recordings.recording import RecordingError
+from perch_eval.recordings.opening import BagRecording, _topic
+from perch_eval.recordings.recording import AslRecording, RecordingError
 from perch_eval.recordings.trajectory import read_trajectory, read_truth
 from recordings import photo_flight
 from unit.recorded_flights import flown, record
@@ -40,6 +39,13 @@ def euroc(files, tmp_path_factory):
         path.write_bytes(path.read_bytes()[:100])
     assert perceive(folder / "asl", "--out", folder, "-p", "powerline_mapper.rate:=2.0") == 0
     return folder
+
+
+@pytest.fixture
+def few_looks(undrawn, monkeypatch):
+    """The page is that of `euroc`, the checks of the sensors are those of `test_checks.py`."""
+    monkeypatch.setattr(check, "SAMPLED_IMAGES", 12)
+    monkeypatch.setattr(check, "SPAN", 4.0)
 
 
 def test_the_motion_is_found(euroc):
@@ -67,7 +73,7 @@ def test_biases_within_what_is_declared_are_no_warning(euroc):
     assert levels["accel bias of VIO"] == levels["gyro bias of VIO"] == "ok"
 
 
-def test_an_accelerometers_bias_beyond_the_sensor_file_is_to_be_declared_and_a_truth_on_another_clock_is_not_compared(files, tmp_path, capsys):
+def test_an_accelerometers_bias_beyond_the_sensor_file_is_to_be_declared_and_a_truth_on_another_clock_is_not_compared(few_looks, files, tmp_path, capsys):
     """0.1 m/s^2 along gravity, where 0.01 is declared."""
     (tmp_path / "far.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
     mine = yaml.safe_load((files / "mine.yaml").read_text())
@@ -85,7 +91,7 @@ def test_the_page_shows_it(euroc):
     assert all(f"<h2>{name}</h2>" in page for name in names) and page.count("data:image/") > 12
 
 
-def test_a_bag_that_broke_off_is_read_as_far_as_it_goes_with_its_truth_on_a_topic(files, tmp_path, capsys):
+def test_a_bag_that_broke_off_is_read_as_far_as_it_goes_with_its_truth_on_a_topic(few_looks, files, tmp_path, capsys):
     """Nothing is damaged in the whole one: `test_checks.py`."""
     whole = next((files / "mcap").glob("*.mcap")).read_bytes()
     cut = tmp_path / "cut.mcap"

@@ -6,6 +6,7 @@ that is shown elsewhere: `runpy` runs the same file, in a process with its own s
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -104,6 +105,30 @@ class Forked:
     def kill(self) -> None:
         """As `Popen`'s."""
         self.send_signal(signal.SIGKILL)
+
+
+class Piped(Forked):
+    """The same with its output in a pipe, `stdout`."""
+
+    def __init__(self, modules: Sequence[str], args: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
+        """As `Forked`."""
+        reads, writes = os.pipe()
+        with os.fdopen(writes, "w") as output:
+            super().__init__(modules, args, output, output, environment)
+        self.stdout = os.fdopen(reads, errors="replace")
+
+
+def popen(command: Sequence[str], *, env: Mapping[str, str], **_: object) -> Piped:
+    """In the place of `subprocess.Popen` in `perch_eval.program`: the nodes of a stack are forked.
+
+    Where a stack starts executables is shown in `test_flight_surface.py`.
+    """
+    words = list(command)[command.index("--") + 1 if "--" in command else 0:]
+    if words[1] == "-m":
+        spec = importlib.util.find_spec(words[2])
+        assert spec is not None and spec.origin is not None
+        words[:3] = [spec.origin]
+    return Piped(NODES, words, env)
 
 
 def run(modules: Sequence[str], args: Sequence[str], timeout: float, environment: Mapping[str, str] | None = None) -> subprocess.CompletedProcess:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import threading
@@ -21,7 +20,7 @@ from perch_eval.nodes import ALL_NODES, node_programs
 from perch_eval.ros.mission_client import FlightResult, MissionClient
 from perch_msgs.msg import ControllerStatus
 from perch_sim.scenario import Scenario, load_scenario
-from system.forks import NODES, Forked
+from system.forks import NODES, Piped
 from system.scripts import PATIENCE
 
 SHORT = """
@@ -44,15 +43,12 @@ class Running:
             command: a Python script and its arguments.
             hear: receives each line that it writes, from a thread of its own.
         """
-        reads, writes = os.pipe()
-        with os.fdopen(writes, "w") as output:
-            self._process = Forked(NODES, command, output, output)
-        self._reader = threading.Thread(target=self._read, args=(reads, hear), daemon=True)
+        self._process = Piped(NODES, command)
+        self._reader = threading.Thread(target=self._read, args=(hear,), daemon=True)
         self._reader.start()
 
-    @staticmethod
-    def _read(file: int, hear: Callable[[str], None]) -> None:
-        with os.fdopen(file, errors="replace") as lines:
+    def _read(self, hear: Callable[[str], None]) -> None:
+        with self._process.stdout as lines:
             for line in lines:
                 hear(line.rstrip())
 

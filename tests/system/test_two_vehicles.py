@@ -1,16 +1,18 @@
 """Two vehicles in two namespaces of one ROS domain fly at once, each as if it were alone and without ROS, to the last bit.
 
 One perches on a wall, the other on a cable. No images are rendered, which would take two minutes of processor time for the cable: its
-map is made from the truth, and stays as it is. That engines agree on images is shown in `test_flight_surface.py`.
+map is made from the truth, and stays as it is. That engines agree on images is shown in `test_flight_surface.py`. The nodes are forked.
 """
 
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from closed_loop.perched import SEEDS, Perched, perched
@@ -24,6 +26,7 @@ from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.stack import Stack
 from perch_sim.contact_event import ContactState
 from perch_sim.scenario import load_scenario
+from system import forks
 from system.scripts import PATIENCE
 
 LINGER = 0.5
@@ -62,6 +65,7 @@ def flights(tmp_path_factory) -> tuple[dict[str, FlightResult], set[str], Path]:
     folder = tmp_path_factory.mktemp("two")
     with pytest.MonkeyPatch.context() as patch, reserved_domain() as domain, ExitStack() as running:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
+        patch.setattr("perch_eval.program.subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": forks.popen}))
         both = {namespace: running.enter_context(vehicle(namespace, folder / namespace.strip("/"))) for namespace in SCENARIOS}
         for stack, pilot in both.values():
             stack.wait_until_ready(pilot.visible_nodes, PATIENCE)

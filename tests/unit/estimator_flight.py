@@ -7,7 +7,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_eval import consistency
-from perch_eval.perch_motion import PerchMotion, PerchMotionConfig, read_imu
+from open_loop.motion import PerchMotion, PerchMotionConfig, read_imu
 from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioPose
 
 DT = 0.002

@@ -1,11 +1,11 @@
-"""The messages of 500 Hz topics as objects of rclpy, field by field: a second source beside `perch_core.ros.messages.fast`."""
+"""The messages of frequent topics as objects of rclpy, field by field: a second source beside `perch_core.ros.messages.fast`."""
 
 from __future__ import annotations
 
 import numpy as np
 from nav_msgs.msg import Odometry
 from perch_core.ros.messages.basic import flat, header, to_pose, to_quaternion, to_vector
-from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust
+from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust, RotorState
 from perch_msgs import msg as perch_msgs
 from sensor_msgs.msg import Imu
 
@@ -43,4 +43,8 @@ def _attitude(command):
                                      body_rates=to_vector(command.w_B), thrust=command.thrust)
 
 
-MESSAGES = {ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motor, RatesThrust: _rates, AttitudeThrust: _attitude}
+def _rotors(state):
+    return perch_msgs.RotorState(header=header(state.stamp, "base_link"), rotor_speed=np.array(state.speed), thrust=np.array(state.thrust))
+
+
+MESSAGES = {ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motor, RatesThrust: _rates, AttitudeThrust: _attitude, RotorState: _rotors}

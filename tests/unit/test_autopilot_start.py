@@ -43,19 +43,17 @@ def domain(monkeypatch) -> Iterator[None]:
         yield
 
 
-class Forked(forks.Forked):
+class Forked(forks.Piped):
     """A node's executable, forked, and what it says, as do the processes that it starts."""
 
     def __init__(self, node: str, words: list[str]) -> None:
-        reads, writes = os.pipe()
-        with os.fdopen(writes, "w") as output:
-            super().__init__(NODES, [executable("perch_autopilot", node), "--ros-args", *words], output, output)
+        super().__init__(NODES, [executable("perch_autopilot", node), "--ros-args", *words])
         self._said: list[str] = []
-        self._reader = threading.Thread(target=self._read, args=(reads,), daemon=True)
+        self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
-    def _read(self, file: int) -> None:
-        with os.fdopen(file, errors="replace") as said:
+    def _read(self) -> None:
+        with self.stdout as said:
             self._said.append(said.read())
 
     def communicate(self, timeout: float | None = None) -> tuple[str, None]:

@@ -15,6 +15,7 @@ from perch_control.laws import LAWS
 from perch_control.modes import State
 from perch_control.parameters import ControllerChoice
 from perch_core.errors import ConfigError, PerchError
+from perch_core.jit import COMPILED, _Compiled
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import (
     NANOSECONDS, AtEnd, Command, ControllerCommand, EstimatorHealth, MappedPowerline, PowerlineMap, SetControllerRequest,
@@ -67,6 +68,16 @@ def test_it_does_not_arm_before_a_vehicle_takes_the_commands():
     assert not flight.motors[-1].armed
     listening = True
     flight.take_off()
+
+
+@pytest.mark.skipif(not COMPILED, reason="nothing is compiled")
+def test_a_step_in_hover_takes_few_calls_of_kernels(monkeypatch):
+    """From the interpreter, a call takes microseconds, whatever the kernel computes; between kernels, it takes nothing."""
+    flight, called = hovering(), []
+    call = _Compiled.__call__
+    monkeypatch.setattr(_Compiled, "__call__", lambda kernel, *arguments: (called.append(kernel.__name__), call(kernel, *arguments))[1])
+    flight.step(0.1)
+    assert len(called) <= 9 * 50, called[-12:]
 
 
 # -- silence -----------------------------------------------------------------------------------------------------------

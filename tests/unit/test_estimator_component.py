@@ -99,7 +99,7 @@ def test_a_missing_stretch_of_samples_is_a_gap_at_100_hz_too():
     hover = Hover(100.0).fly(1.0)
     hover.now += 50 * MS
     hover.fly(0.01)
-    assert "gap" in hover.estimator._estimator.status.message
+    assert "gap" in hover.estimator.filter.status.message
     hover.fly(1.0).assert_running()
 
 

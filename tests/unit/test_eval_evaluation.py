@@ -18,9 +18,8 @@ from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
 from perch_eval.evaluation import command, control, inspection, kept, planning_times
 from perch_eval.evaluation.cable import cable_of_length, cable_sections
-from perch_eval.evaluation.nonlinear import solve
-from perch_eval.evaluation.planning_times import SETTINGS, waypoint_problem
-from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.evaluation.planning_times import SETTINGS, solve, waypoint_problem
+from perch_eval.evaluation.document import Effort, Section
 from perch_planner.paper import paper_m
 
 
@@ -154,7 +153,7 @@ def test_an_interrupted_evaluation_leaves_pages_and_figures_as_they_were(parts, 
     for interrupts, code, content in ((True, 130, ["old", "old", "old"]), (False, 0, ["new", "# Res", "old"])):
         assert command.main(["--out", "results"]) == code
         assert [Path("results", name).read_text()[:5] for name in ("figure.png", "README.md", "notes.txt")] == content
-    assert "finished flights are kept, except those of c_consistency" in capsys.readouterr().err
+    assert "finished flights are kept: the same command" in capsys.readouterr().err
     assert {file.name for file in Path("results").iterdir()} == {"figure.png", "README.md", "notes.txt", "results.json"}
 
 
@@ -199,7 +198,7 @@ def test_parts_have_their_places_on_the_page_whatever_order_they_are_asked_for_i
     assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("[")] == ["[1/2] a", "[2/2] c"]
 
 
-@pytest.mark.parametrize("arguments", [["--jobs", "0"], ["--seeds", "-1"], ["--line-seeds", "many"], ["--quick", "--full"]])
+@pytest.mark.parametrize("arguments", [["--jobs", "0"], ["--seeds", "-1"], ["--line-seeds", "many"]])
 def test_wrong_arguments_are_invalid_input(arguments):
     with pytest.raises(SystemExit) as end:
         command.main(arguments)

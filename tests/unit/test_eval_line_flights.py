@@ -9,12 +9,10 @@ from perch_core import so3
 from perch_core.trajectory import SampledTrajectory
 from perch_core.values import AtEnd, Contact, MappedPowerline, PowerlineMap, TrajectoryOrder, nanoseconds
 from perch_eval.campaign.results import RunResult
-from perch_eval.evaluation import kept, powerline, powerline_flights
-from perch_eval.evaluation.powerline import POSITION, flown_sections
-from perch_eval.evaluation.powerline_flights import hovers_at_end, mapping_errors, perching_errors
-from perch_eval.evaluation.sections import FAILS, HOLDS, SHOWN, VACUOUS, Effort
+from perch_eval.evaluation import kept, powerline
+from perch_eval.evaluation.document import FAILS, HOLDS, SHOWN, VACUOUS, Effort
+from perch_eval.evaluation.powerline import POSITION, flown_sections, hovers_at_end, mapping_errors, perching_errors
 from perch_eval.flight import Flight, States
-from perch_eval.revision import digest
 from perch_sim.scenario import Cable, Mission, Scenario, World
 
 OFFSET, TILT = np.array([0.01, -0.02, 0.02]), np.radians(4.0)  # of the flown from the planned: 3 cm, 4 deg
@@ -97,9 +95,15 @@ def test_a_crash_on_the_way_is_no_error_at_the_perch():
     assert set(perching_errors(flight, scenario(), 0.15).values()) == {None}
 
 
+@pytest.fixture(autouse=True)
+def unchanged_code(monkeypatch):
+    """Each stored flight would read all code again, to see that it is still the same; `test_eval_evaluation.py` shows what comes of a change."""
+    monkeypatch.setattr(kept, "require_code", lambda *_: None)
+
+
 def effort(tmp_path, seeds: int) -> Effort:
     return Effort(True, 1, tmp_path, tmp_path, "evaluate.py", seeds=range(1, 2), seeds_on_lines=range(1, 1 + seeds), layouts=1,
-                  code={"commit": "1234567", "digest": digest()})
+                  code={"commit": "1234567", "digest": "0123456789ab"})
 
 
 def test_a_hover_at_the_end_is_slow_high_and_free_of_the_wire():
@@ -121,11 +125,11 @@ def test_some_scenarios_are_flown_without_a_grip_as_well_and_keep_their_numbers_
             yield task, asdict(RunResult(task.run.number, task.run.seed, "perched", "perched", "", task.run.values))
 
     monkeypatch.setattr(kept, "in_processes", pool)
-    found = powerline_flights.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"))
+    found = powerline.flights(effort(tmp_path, 2), ("line_80_pa", "line_180"))
     assert {key: [r.seed for r in runs] for key, runs in found.items()} == {
         ("line_80_pa", True): [1, 2], ("line_80_pa", False): [], ("line_180", True): [1, 2], ("line_180", False): [1, 2]}
     assert all(task.scenario.get("grip", {}).get("enabled", True) == task.run.values["grips"] for task in handed)
-    found = powerline_flights.flights(effort(tmp_path, 5), ("line_80_pa", "line_180"))
+    found = powerline.flights(effort(tmp_path, 5), ("line_80_pa", "line_180"))
     assert [r.seed for r in found["line_180", False]] == [1, 2, 3] and [r.seed for r in found["line_180", True]] == [1, 2, 3, 4, 5]
     assert len(handed) == len({task.run.number for task in handed}) == 13, "nothing is flown twice"
 

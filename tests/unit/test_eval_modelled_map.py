@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from perch_core.values import CameraModel, OdometryState
 from perch_core.vehicle import load_vehicle
-from perch_eval.in_process.modelled_sight import MapParameters, ModelledMap
+from perch_eval.in_process.modelled_sight import MapParameters, ModelledLocalizer, ModelledMap
+from perch_perception.target_localizer import TargetLocalizerConfig
 from perch_sim.scenario import load_scenario
+from perch_sim.state_history import StateHistory, TrueState
 
 LINE = load_scenario("line_80")
 NEAR = np.array([4.0, 0.0, 4.25])  # a point of the first cable, which runs along y
@@ -64,3 +66,11 @@ def test_a_cable_out_of_view_stays_where_it_was_while_the_estimate_drifts():
 
 def test_a_seed_repeats():
     assert Flight(3).look(NEAR - [2.0, 0.0, 0.0])[0] == pytest.approx(Flight(3).look(NEAR - [2.0, 0.0, 0.0])[0], abs=0.0)
+
+
+def test_an_image_from_before_the_truth_was_heard_first_shows_nothing():
+    truth = StateHistory(10)
+    truth.append(TrueState(1_490_000_000, np.r_[np.zeros(3), 0.0, 0.0, 0.0, 1.0, np.zeros(6)]))
+    sight = ModelledLocalizer(TargetLocalizerConfig(), load_scenario("surface_90_ideal"), 1, truth, lambda: None)
+    found = sight.process(None, 1.148, None)
+    assert found.board is None and "outside" in found.message

@@ -241,7 +241,7 @@ def test_a_report_for_which_there_is_no_room_is_not_half_written_and_the_outcome
 
 
 @pytest.mark.parametrize("came_off, code, words", [(False, 0, "outcome: perched\n"), (True, 1, "outcome: perched (came_off: ")])
-def test_a_perch_is_one_by_the_truth_in_report_and_exit_code(tmp_path, monkeypatch, capsys, came_off, code, words):
+def test_a_perch_is_one_by_the_truth_in_report_and_exit_code(undrawn, tmp_path, monkeypatch, capsys, came_off, code, words):
     flight = flown()
     flight["contact"] += [(3.5, Contact(3_500_000_000, 0, "pad", 0.0, 0.0, 0.0, 0.0, ""))] * came_off
     record(tmp_path / "flight.mcap", flight)
@@ -252,7 +252,7 @@ def test_a_perch_is_one_by_the_truth_in_report_and_exit_code(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("perch, part", [(True, ""), (False, ", of the whole recording")])
-def test_figures_of_a_flight_without_a_planned_perch_are_named_as_those_of_the_whole_recording(tmp_path, perch, part):
+def test_figures_of_a_flight_without_a_planned_perch_are_named_as_those_of_the_whole_recording(undrawn, tmp_path, perch, part):
     flight = flown()
     if not perch:
         del flight["trajectory"]

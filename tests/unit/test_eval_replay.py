@@ -29,7 +29,7 @@ from perch_eval.flight import Flight, timed
 from perch_eval.flight_view import FlightView
 from perch_eval.mcap_log import read
 from perch_eval.metrics import figures, flight_metrics, perch_window, rates, thrust_history
-from perch_eval.page import Html, section, table
+from perch_eval.page import Html, figure_rows, in_words, section, table
 from perch_eval.replay import animation, command
 from perch_eval.replay.command import main
 from perch_eval.replay.stroboscope import stroboscope
@@ -161,7 +161,12 @@ def test_tables_escape_what_they_are_given():
     ("clock_offset_s", "clock offset 12.5 s"), ("steps_per_s", "steps 12.5 per s"),
     ("updates_rejected", "updates rejected 12.5")])
 def test_diagnostics_are_words_with_units(key, words):
-    assert report._with_unit(key, 12.5) == words
+    assert " ".join(in_words(key, 12.5)) == words
+
+
+def test_figures_are_rows_with_units_and_none_of_what_is_not_known():
+    figures = {"damage": "", "vio": {"path_m": 1.5, "ate_rmse_deg": np.nan}, "frame_ms": {"p99": 12.0}, "problems": ["a", "b"]}
+    assert figure_rows(figures) == [("vio path", "1.5 m"), ("frame p99", "12 ms"), ("problems", "a"), ("problems", "b")]
 
 
 def test_an_animation_has_a_frame_for_each_moment_and_plots_are_written(recorded, tmp_path):
@@ -181,8 +186,7 @@ def test_an_animation_takes_its_time(fps, tmp_path):
     assert total == pytest.approx(1000.0 * 61 / fps, abs=10.0)
 
 
-def test_two_recordings_of_a_flight_are_the_same_flight_though_one_has_a_report(recorded, monkeypatch):
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
+def test_two_recordings_of_a_flight_are_the_same_flight_though_one_has_a_report(recorded, undrawn):
     path, flight = recorded
     one = comparison.read("a", "r", path)
     other = replace(one, until=one.until - 0.1, report={**one.report, "flight_hash": flight.digest(one.until - 0.1)})

@@ -11,7 +11,7 @@ from perch_core import so3
 from perch_core.vehicle import load_vehicle
 from perch_eval.campaign.results import RunResult
 from perch_eval.evaluation import control, inspection, perching, powerline, ways_out
-from perch_eval.evaluation.sections import Effort
+from perch_eval.evaluation.document import Effort
 from perch_eval.inspection.measures import inspection_result, judge, reference_states, segments, watched
 from perch_sim.scenario import load_scenario
 
@@ -97,7 +97,7 @@ def test_refusals_that_differ_in_the_interval_found_are_one_line(effort, monkeyp
 
 
 @pytest.mark.slow
-def test_an_inspection_that_is_given_up_has_not_avoided_the_lines(effort, monkeypatch):
+def test_an_inspection_that_is_given_up_has_not_avoided_the_lines(effort, undrawn, monkeypatch):
     scenario = load_scenario("inspection")
     times, states = reference_states(scenario)
     still = inspection_result(scenario, times[:50], np.repeat(states[:1], 50, axis=0), 0, "the controller has landed")

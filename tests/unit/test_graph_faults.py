@@ -16,9 +16,10 @@ from types import SimpleNamespace
 
 import pytest
 from perch_core.errors import PerchError
+from perch_eval.ending import SAFE, Situation, ending
 from perch_eval.graph_faults import campaign
 from perch_eval.graph_faults.cases import (
-    FAULTS, LOCKSTEP, MODES, NODE_PATTERNS, NODES, PHASES, PROCESS, REAL_TIME, SAFE, Case, Situation, cases, ending, first_report)
+    FAULTS, LOCKSTEP, MODES, NODE_PATTERNS, NODES, PHASES, PROCESS, REAL_TIME, Case, cases, first_report)
 from perch_eval.graph_faults.flight import UNANSWERED, _FaultInjector
 from perch_eval.graph_faults.group import Group
 from perch_eval.graph_faults.relay_node import DELAY, Disturbance

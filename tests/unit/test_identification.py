@@ -11,7 +11,7 @@ from perch_core.vehicle import Battery, load_vehicle
 from perch_eval.flight import Flight
 from perch_eval.identification import command, responses
 from perch_eval.identification.fit import Estimate, battery, identify, rates, thrust
-from perch_eval.identification.record import Record, record_of
+from perch_eval.identification.flight import Record, record_of
 from scipy.signal import lfilter, lfiltic
 
 VEHICLE = load_vehicle("snapdragon_rates")

@@ -58,6 +58,19 @@ def test_motors_stop_whatever_else_a_command_says(command):
     assert limits.problem(command) and not limits.problem(command._replace(armed=False))
 
 
+@pytest.mark.parametrize("limit", [limits.VELOCITY, limits.Limit(0.0, inf, "s"), limits.Limit(0.3, 10.0, "m", optional=True)])
+@pytest.mark.parametrize("x", [0.0, -0.0, 0.3, 5.0, 100.0, 100.1, -100.0, inf, -inf, nan])
+def test_floats_and_arrays_have_the_same_limits(limit, x):
+    value = (0.5, x, 0.5) if limit.shape else x
+    assert limit.problem(value) == limit.problem(np.array(value))
+
+
+def test_valid_floats_are_judged_without_numpy(monkeypatch):
+    state = RotorState(7, (1200.0, 1200.0, 1200.0, 1200.0), (0.7, 0.7, 0.7, 0.7))
+    monkeypatch.setattr(limits, "np", None)
+    assert not limits.problem(state)
+
+
 def test_a_request_is_refused_with_its_source():
     with pytest.raises(ConfigError, match=r"request: lines\[0\].radius: 3 is outside \[0.0001, 1\] m"):
         limits.check("request", PowerlineMap(0, (LINE._replace(radius=3.0),), False, ""))

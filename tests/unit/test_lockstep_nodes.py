@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from types import SimpleNamespace
 
@@ -220,6 +221,18 @@ def test_a_vehicle_that_fails_in_a_step_says_so_once_and_why(executor, monkeypat
     values = {pair.key: pair.value for pair in reported[-1].values}
     assert reported[-1].level == DiagnosticStatus.ERROR
     assert values["waiting_for"] == "a new start, as the simulation has failed: PerchError: the state is not finite"
+
+
+def test_a_burst_does_not_look_for_messages_again_right_after_it_has_received_some(vehicle, monkeypatch):
+    made, _, _ = vehicle
+    completed, looks = itertools.cycle([False, True]), []
+    monkeypatch.setattr(made, "_schedule", SimpleNamespace(names=["controller"], advance=lambda: next(completed), await_image=lambda timeout: False,
+                                                           pending=lambda: [SimpleNamespace(name="controller")]))
+    monkeypatch.setattr(made, "_remote", {"controller": None})
+    monkeypatch.setattr(made, "_receive", lambda timeout: looks.append(timeout > 0.0) or timeout > 0.0)
+    monkeypatch.setattr(made, "_advance_queued", True)
+    made._burst()
+    assert looks == [False, True] * (len(looks) // 2)
 
 
 def test_a_participant_without_a_vehicle_says_so(executor, monkeypatch):

@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 import pytest
 from perch_core.errors import PerchError
-from perch_core.ros.messages.sensing import compressed_value, image_message, image_value
+from perch_core.ros.messages.sensing import compressed_value, image_value, pack_image, unpack_image
+from perch_core.values import CameraImage
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CompressedImage, Image
 
 
@@ -24,10 +26,22 @@ def message(encoding, channels, padding=0):
 @pytest.mark.parametrize("padding", [0, 5])
 def test_every_encoding_of_8_bits_is_read_by_rows(encoding, channels, named, padding):
     sent, rows = message(encoding, channels, padding)
-    image = image_value(sent)
-    assert (image.width, image.height, image.encoding) == (8, 4, named)
-    np.testing.assert_array_equal(image.pixels().reshape(4, -1), rows)
-    np.testing.assert_array_equal(image_value(image_message(image)).pixels(), image.pixels())
+    for image in (image_value(sent), unpack_image(serialize_message(sent))):
+        assert (image.width, image.height, image.encoding) == (8, 4, named)
+        np.testing.assert_array_equal(image.pixels().reshape(4, -1), rows)
+        np.testing.assert_array_equal(unpack_image(pack_image(image)).pixels(), image.pixels())
+
+
+def test_a_packed_image_is_the_message_of_rclpy_and_its_pixels_are_not_copied_when_it_is_read():
+    pixels = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    data = pack_image(CameraImage(5_000_000_123, "camera_down_optical_frame", 6, 4, "mono8", pixels[:, ::-1]))
+    sent = deserialize_message(data, Image)
+    assert (sent.header.stamp.sec, sent.header.stamp.nanosec, sent.header.frame_id) == (5, 123, "camera_down_optical_frame")
+    assert (sent.width, sent.height, sent.step, sent.encoding) == (6, 4, 6, "mono8") and bytes(sent.data) == pixels[:, ::-1].tobytes()
+    assert np.shares_memory(unpack_image(data).pixels(), np.frombuffer(data, np.uint8))
+    for length in range(0, len(data), 7):
+        with pytest.raises(PerchError):
+            unpack_image(data[:length])
 
 
 def test_other_encodings_are_refused_with_those_that_are_read():

@@ -490,6 +490,17 @@ def test_cancelled_when_no_way_out_is_left_the_wire_is_the_goals_end_unless_the_
     assert world.commands[-1] is Command.HOVER, "the recovery follows where the gripper has not closed"
 
 
+def test_cancelled_when_no_way_out_is_left_a_surface_is_the_goals_end():
+    world = World().send().run(until=lambda w: w.contact is not None)
+    world.run(until=lambda w: seconds(w.stamp) > w.contact - 0.05)
+    world.goal.cancel_requested = True
+    world.run(0.02)
+    assert world.goal.told[-1].message.startswith("cancelled too late: ")
+    world.run()
+    assert Command.HOVER not in world.commands and world.goal.ending == "cancelled"
+    assert world.goal.result.message.startswith("cancelled too late: perched")
+
+
 PATH = rest_to_rest(np.zeros(3), SURFACE.p_WS, 0.0, 0.0, 3.0, start_time=20.0)
 
 

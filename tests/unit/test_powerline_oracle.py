@@ -35,5 +35,5 @@ def test_a_perch_is_planned_where_a_soft_end_stays_off(pitch_deg: float, along: 
     start, line = REQUEST.start.copy(), SETUP.segments()[2]
     start[P], start[Q], start[V] = position, so3.quat_exp(np.array([0.0, 0.0, yaw])), velocity
     perch = PerchPose.on_line(line, line.centre + along * line.direction, np.radians(pitch_deg), VEHICLE.wire_offset, start[P])
-    request = replace(REQUEST, start=start, target_line=2, perch=perch, perception=True, with_recovery=False, deadline=10.0)
+    request = replace(REQUEST, start=start, target_line=2, perch=perch, perception=True, with_recovery=False, deadline=60.0)
     assert all(bound.holds for bound in PowerlinePlanner(VEHICLE, SETUP.settings).plan(request).bounds)

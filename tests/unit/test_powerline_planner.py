@@ -31,7 +31,7 @@ from system.scripts import call_script
 ROOT = Path(__file__).resolve().parents[2]
 VEHICLE = load_vehicle("rpg")
 SETUP = problem.load("powerline_line_80")
-REQUEST = SETUP.request(VEHICLE)
+REQUEST = replace(SETUP.request(VEHICLE), deadline=60.0)  # a busy machine plans, too
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_a_plan_is_found_where(planner: PowerlinePlanner, why: str, target: int,
     start[P], start[Q], start[V] = position, so3.quat_exp(np.array([0.0, 0.0, yaw])), velocity
     line = SETUP.segments()[target]
     perch = PerchPose.on_line(line, line.centre + along * line.direction, np.radians(pitch_deg), VEHICLE.wire_offset, start[P])
-    plan = planner.plan(replace(REQUEST, start=start, target_line=target, perch=perch, perception=perception, deadline=10.0))
+    plan = planner.plan(replace(REQUEST, start=start, target_line=target, perch=perch, perception=perception))
     assert plan.recovery is not None and all(bound.holds for bound in plan.bounds), why
 
 
@@ -68,8 +68,7 @@ def test_a_plan_is_found_near_the_limits(planner: PowerlinePlanner, why: str, li
     start = REQUEST.start.copy()
     start[P] = position
     perch = PerchPose.on_line(line, line.centre, np.radians(pitch_deg), VEHICLE.wire_offset, start[P])
-    plan = planner.plan(replace(REQUEST, start=start, lines=(line,), target_line=0, perch=perch, perception=perception, with_recovery=False,
-                                deadline=10.0))
+    plan = planner.plan(replace(REQUEST, start=start, lines=(line,), target_line=0, perch=perch, perception=perception, with_recovery=False))
     assert all(bound.holds for bound in plan.bounds), why
 
 
@@ -82,7 +81,7 @@ def test_clearance_in_the_open_is_eased_where_no_plan_has_what_is_shipped(what: 
     start[P], start[Q], start[V] = position, so3.quat_exp(np.array([0.0, 0.0, yaw])), velocity
     line = SETUP.segments()[2]
     perch = PerchPose.on_line(line, line.centre + along * line.direction, np.radians(pitch_deg), VEHICLE.wire_offset, start[P])
-    request = replace(REQUEST, start=start, target_line=2, perch=perch, perception=False, deadline=10.0)
+    request = replace(REQUEST, start=start, target_line=2, perch=perch, perception=False)
     plan = PowerlinePlanner(VEHICLE, SETUP.settings).plan(request)
     assert plan.recovery is not None and all(bound.holds for bound in plan.bounds), what
 
@@ -206,7 +205,7 @@ def near_the_ground(drop: float = 2.6) -> PowerlineRequest:
     start = REQUEST.start.copy()
     start[2] -= drop
     perch = PerchPose.on_line(lines[0], lines[0].centre, np.pi, VEHICLE.wire_offset, start[P])
-    return replace(REQUEST, start=start, lines=lines, perch=perch, with_recovery=False, deadline=60.0)
+    return replace(REQUEST, start=start, lines=lines, perch=perch, with_recovery=False)
 
 
 def test_a_perch_that_is_not_found_is_refused_with_the_limit_without_which_it_is(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,7 +251,7 @@ def test_each_search_for_the_cause_gets_the_time_that_is_left(planner: Powerline
 def test_a_perch_found_without_a_limit_that_it_keeps_is_a_plan(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
     solve = planner.solver.solve
     monkeypatch.setattr(planner.solver, "solve", lambda structure, data, phase: replace(solve(structure, data, phase), converged=phase == "trial"))
-    perch = planner.plan(replace(REQUEST, with_recovery=False, deadline=60.0)).perch
+    perch = planner.plan(replace(REQUEST, with_recovery=False)).perch
     assert all(bound.holds for bound in perch.bounds)
     assert next(bound for bound in perch.bounds if bound.quantity == "height").lower_limit == planner.settings.height_min
 

@@ -36,6 +36,13 @@ def test_starts_at_rest_with_the_gyro_bias():
     assert np.abs(flight.error()[3:6]).max() < 0.05
 
 
+def test_the_motion_is_that_of_the_estimate_to_the_last_bit():
+    flight = Flight(3)
+    assert flight.estimator.motion is None
+    e = flight.fly(end=400).estimator.estimate
+    assert flight.estimator.motion == (*e.p_WB, *e.v_WB, *e.q_WB, *e.w_WB_B)
+
+
 def test_starts_in_motion_from_vios_pose_and_velocity():
     flight = Flight(4)
     flight.poses = {k: v for k, v in flight.poses.items() if k > 2000}  # VIO comes up in mid-flight

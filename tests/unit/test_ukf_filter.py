@@ -9,7 +9,7 @@ import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from perch_core import so3
 from perch_core.vehicle import GRAVITY
-from perch_eval.perch_motion import PerchMotion
+from open_loop.motion import PerchMotion
 from perch_perception.ukf import UkfConfig, VioPose, kernels, start, unscented, update_kernels
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.unscented import Belief, CovarianceError, UnscentedTransform

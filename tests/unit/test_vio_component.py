@@ -12,8 +12,8 @@ from perch_core.camera import RadialTangentialCamera
 from perch_core.config import from_mapping
 from perch_core.values import CameraImage, CameraModel, ImuSample, InertialState, OdometryState, Transform
 from perch_core.vehicle import load_vehicle
-from perch_eval.estimation_flight import motion_of
-from perch_eval.perch_motion import read_imu
+from open_loop.flight import motion_of
+from open_loop.motion import read_imu
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.ukf import UkfConfig
 from perch_perception.vio_component import VioComponent, VioComponentConfig

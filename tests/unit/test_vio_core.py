@@ -7,7 +7,7 @@ import pytest
 from perch_core import so3
 from perch_core.camera import PinholeCamera, RadialTangentialCamera
 from perch_core.vehicle import GRAVITY, load_vehicle
-from perch_eval.perch_motion import PerchMotion
+from open_loop.motion import PerchMotion
 from perch_core.values import ImuSample
 from perch_perception.ukf.imu_buffer import ImuBuffer
 from perch_perception.vio import VioConfig, bearing, ekf, lens

@@ -10,7 +10,7 @@ import scipy.linalg
 from perch_core import so3
 from perch_core.sensors import CalibrationSigmas
 from perch_core.vehicle import load_vehicle
-from perch_eval.perch_motion import Motion, PerchMotion, read_imu
+from open_loop.motion import Motion, PerchMotion, read_imu
 from unit import simulated_tracks
 from unit.simulated_tracks import bounds
 from perch_core.values import ImuSample

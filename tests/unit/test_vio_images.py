@@ -10,8 +10,8 @@ import pytest
 from closed_loop.branches import branched
 from perch_core.values import ImuSample
 from perch_core.vehicle import load_vehicle
-from perch_eval import estimation_flight as flights
-from perch_eval.perch_motion import Motion
+from open_loop import flight as flights
+from open_loop.motion import Motion
 from perch_perception.ukf import Health
 from perch_perception.vio import FrameOutcome, VioConfig
 from perch_perception.vio import tracker as tracking

@@ -8,7 +8,7 @@ from perch_core import so3
 from perch_core.imu_axes import ImuAxes
 from perch_core.values import ImuSample, RotorState, Transform
 from perch_core.vehicle import GRAVITY, load_vehicle
-from perch_eval.perch_motion import PerchMotion, read_imu
+from open_loop.motion import PerchMotion, read_imu
 from perch_perception.ukf.imu_buffer import ImuBuffer, ImuOutcome
 from perch_perception.vio import FrameOutcome, VioConfig, VisualInertialOdometry
 from perch_perception.vio import state as at

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from perch_control.geometric.controller import packed_vehicle
 from perch_control.geometric.step import predicted, wrench_of
 from perch_control.period import NOMINAL_PERIOD
-from perch_control.rotor_lag import RotorEstimate, approached, lag_share, thrusts
+from perch_control.rotor_lag import RotorEstimate, followed, lag_share, thrusts
 from perch_core.jit import compiled
 from perch_core.vector3 import axpy, cross, limited, scale, times, turned
 from perch_core.vehicle import Vehicle
@@ -159,7 +159,7 @@ class InnerLoopEstimate(NamedTuple):
             w_C: feed-forward rates of an attitude loop [rad/s].
         """
         a, tau, nominal = vehicle.actuation, vehicle.motor_time_constant, self.nominal
-        reached = approached(self.at_effect.speed, command, lag_share(self.period, tau))
+        reached = followed(self.at_effect.speed, command, self.period, tau)
         share = lag_share(self.period, a.thrust_lag)
         thrust_ratio = vehicle.thrust_coefficient / nominal.thrust_coefficient
         *rates, thrust = loop_command(thrusts(reached, vehicle.thrust_coefficient), state[10:13], thrust_ratio * self.thrust,

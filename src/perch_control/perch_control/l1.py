@@ -64,6 +64,48 @@ def adapted(predicted, measured, filtered, decay, dt, bandwidth, bounds):
     return raw, (force[0], force[1], force[2], moment[0], moment[1], moment[2])
 
 
+@compiled
+def predicted_value(z, r0, r, d, m, dt):
+    """One component of the prediction from the last sample to this one, by the trapezoidal rule; `z`, `d`, `m`: at the last one.
+
+    Args:
+        z, m: prediction and measurement.
+        r0, r: accelerations of the model at the last sample and at this one.
+        d: disturbance.
+        dt: time between the samples [s].
+    """
+    return z + dt * (0.5 * (r + r0) + d - _DECAY * (z - m))
+
+
+@compiled
+def l1_step(state, speed, dt, last, filtered, bandwidth, vehicle):
+    """Predictor, adaptation and filter at one sample.
+
+    Args:
+        state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
+        speed: present rotor speeds [rad/s], 4 floats.
+        dt: time since the last sample [s]; 0: the predictor begins with this one.
+        last: accelerations of the model, prediction, measurement and disturbance at the last sample, 6 floats each.
+        filtered, bandwidth: as in `adapted`.
+        vehicle: constants (see `packed_vehicle`).
+
+    Returns:
+        `last` of the next sample, and the filtered disturbance, 6 floats.
+    """
+    measured = (state[3], state[4], state[5], state[10], state[11], state[12])
+    rates = model_rates(state, thrusts(speed, vehicle[1][0]), vehicle)
+    if dt <= 0.0:
+        return (rates, measured, measured, _ZERO), filtered
+    r0, z, m, d = last
+    predicted = (
+        predicted_value(z[0], r0[0], rates[0], d[0], m[0], dt), predicted_value(z[1], r0[1], rates[1], d[1], m[1], dt),
+        predicted_value(z[2], r0[2], rates[2], d[2], m[2], dt), predicted_value(z[3], r0[3], rates[3], d[3], m[3], dt),
+        predicted_value(z[4], r0[4], rates[4], d[4], m[4], dt), predicted_value(z[5], r0[5], rates[5], d[5], m[5], dt),
+    )
+    raw, filtered = adapted(predicted, measured, filtered, _DECAY, dt, bandwidth, (_FORCE_MAX, _MOMENT_MAX))
+    return (rates, predicted, measured, raw), filtered
+
+
 class L1Augmentation:
     """Owns predictor and filter.
 
@@ -81,7 +123,8 @@ class L1Augmentation:
     def reset(self) -> None:
         """Reset the disturbance and the predictor: the vehicle may be on the ground, it recovers, or its model has changed."""
         self.disturbance = _ZERO
-        self._last: tuple | None = None
+        self._time: float | None = None  # of the last sample [s]; None: the predictor begins with the next one
+        self._last = (_ZERO,) * 4  # see `l1_step`
 
     def set_vehicle(self, vehicle: Vehicle, explained: tuple[float, ...] | None = None) -> None:
         """Use another model of the vehicle.
@@ -99,8 +142,8 @@ class L1Augmentation:
 
     def hold(self) -> tuple[float, ...]:
         """Return the compensation without adaptation, while the vehicle may be in contact."""
-        self._last = None
-        return tuple(-x for x in self.disturbance)
+        self._time = None
+        return self._compensation
 
     def update(self, state: tuple[float, ...], speed: tuple[float, ...], now: float) -> tuple[float, ...]:
         """Adapt to a state; returns the compensation of the disturbance, 6 floats (see `geometric_step`).
@@ -110,14 +153,13 @@ class L1Augmentation:
             speed: present rotor speeds [rad/s], 4 floats.
             now: time of the state [s].
         """
-        measured = (*state[3:6], *state[10:13])
-        rates, predicted, raw = model_rates(state, thrusts(speed, self._vehicle[1][0]), self._vehicle), measured, _ZERO
-        if self._last is not None and 0.0 < now - self._last[0] < _LONGEST_GAP:
-            time, rates0, predicted0, measured0, raw0 = self._last
-            dt = now - time
-            predicted = tuple(z + dt * (0.5 * (r + r0) + d - _DECAY * (z - m))
-                              for z, r, r0, d, m in zip(predicted0, rates, rates0, raw0, measured0))
-            raw, self.disturbance = adapted(predicted, measured, self.disturbance, _DECAY, dt,
-                                            self.bandwidth, (_FORCE_MAX, _MOMENT_MAX))
-        self._last = (now, rates, predicted, measured, raw)
-        return tuple(-x for x in self.disturbance)
+        dt = 0.0 if self._time is None else now - self._time
+        self._time = now
+        self._last, self.disturbance = l1_step(state, speed, dt if 0.0 < dt < _LONGEST_GAP else 0.0, self._last, self.disturbance,
+                                               self.bandwidth, self._vehicle)
+        return self._compensation
+
+    @property
+    def _compensation(self) -> tuple[float, ...]:
+        a, b, c, d, e, f = self.disturbance
+        return -a, -b, -c, -d, -e, -f

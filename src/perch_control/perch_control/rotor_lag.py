@@ -30,6 +30,12 @@ def approached(speed, target, share):
 
 
 @compiled
+def followed(speed, command, duration, time_constant):
+    """Rotor speeds after a time [s] in which they have followed a constant command [rad/s], 4 floats."""
+    return approached(speed, command, lag_share(duration, time_constant))
+
+
+@compiled
 def thrusts(speed, coefficient):
     """Rotor thrusts [N] from rotor speeds [rad/s], 4 floats each."""
     return (coefficient * speed[0] * speed[0], coefficient * speed[1] * speed[1],
@@ -91,7 +97,7 @@ class RotorEstimate(NamedTuple):
 
     def after(self, duration: float, time_constant: float) -> RotorEstimate:
         """The same rotors `duration` seconds later, still following their command."""
-        return RotorEstimate(approached(self.speed, self.command, lag_share(duration, time_constant)), self.command)
+        return RotorEstimate(followed(self.speed, self.command, duration, time_constant), self.command)
 
     def following(self, command: tuple[float, ...], *_: object) -> RotorEstimate:
         """The same rotors with a new command."""

@@ -93,13 +93,3 @@ def freeze_heap() -> None:
     """Exclude all present objects from garbage collection: scanning them again takes up to 0.1 s, at any moment."""
     gc.collect()
     gc.freeze()
-
-
-@contextmanager
-def frozen_heap() -> Iterator[None]:
-    """Apply `freeze_heap` in this context."""
-    freeze_heap()
-    try:
-        yield
-    finally:
-        gc.unfreeze()

@@ -89,7 +89,7 @@ def read(name: str, colour: str, path: Path, namespace: str = "", vehicle: str =
     flight_hash = report["flight_hash"] if report.get("simulated_time_s") else flight.digest(until)
     report = {**report, **flight_metrics(flight, until), "flight_hash": flight_hash}
     found = {one["name"]: one for one in report.get("margins", ()) if one.get("left") is not None}
-    found |= {one.name: one.mapping() for one in margins(flight, model) if identified is not None}
+    found |= {one["name"]: one for one in margins(flight, model) if identified is not None}
     return Side(until, view, report | {"margins": list(found.values())}, identified is not None)
 
 

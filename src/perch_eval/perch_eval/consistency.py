@@ -13,6 +13,8 @@ import numpy as np
 from perch_core import so3
 from perch_core.probability import chi2_quantile
 
+PROBABILITIES = np.array([0.025, 0.975])  # of the bounds
+
 
 def nees(errors: np.ndarray, covariances: np.ndarray) -> np.ndarray:
     """Normalised estimation error squared, e^T P^-1 e.
@@ -42,16 +44,18 @@ class Consistency:
         dimension: degrees of freedom of one sample.
         times: shape (m,) [s].
         mean: average over the runs at each time, shape (m,).
-        bounds: 95 % bounds of the average for a consistent filter.
+        bounds: 95 % bounds of the average for a consistent filter at each time, shape (2, m).
         runs: number of runs.
+        samples_inside: share of the single samples inside the 95 % bounds of one sample.
     """
 
     name: str
     dimension: int
     times: np.ndarray
     mean: np.ndarray
-    bounds: tuple[float, float]
+    bounds: np.ndarray
     runs: int
+    samples_inside: float
 
     @property
     def inside(self) -> float:
@@ -70,7 +74,7 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int) -> 
     Args:
         name: what was tested.
         times: shape (m,) [s].
-        samples: shape (runs, m).
+        samples: shape (runs, m); NaN where a run has none. Times at which less than half of the runs have one are left out.
         dimension: degrees of freedom of one sample.
 
     Raises:
@@ -79,9 +83,13 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int) -> 
     samples = np.asarray(samples, float)
     if samples.ndim != 2 or samples.shape[1] != len(times):
         raise ValueError(f"samples of shape {samples.shape} do not fit {len(times)} times")
-    runs, tail = len(samples), 0.5 * (1 - 0.95)
-    low, high = chi2_quantile(np.array([tail, 1 - tail]), runs * dimension) / runs
-    return Consistency(name, dimension, np.asarray(times), samples.mean(axis=0), (float(low), float(high)), runs)
+    counts = np.isfinite(samples).sum(axis=0)
+    used = 2 * counts >= max(len(samples), 1)
+    samples, counts = samples[:, used], counts[used]
+    low, high = np.array([chi2_quantile(PROBABILITIES, n * dimension) / n for n in (1, *counts.tolist())]).reshape(-1, 2).T
+    single = samples[np.isfinite(samples)]
+    return Consistency(name, dimension, np.asarray(times)[used], np.nanmean(samples, axis=0), np.stack([low[1:], high[1:]]), len(samples),
+                       float(np.mean((single >= low[0]) & (single <= high[0]))))
 
 
 def plot(results: list[Consistency], path: Path, marks: dict[str, float]) -> None:
@@ -100,7 +108,7 @@ def plot(results: list[Consistency], path: Path, marks: dict[str, float]) -> Non
     for axes in panels.flat[len(results):]:
         axes.axis("off")
     for axes, result in zip(panels.flat, results):
-        axes.axhspan(*result.bounds, color="0.88")
+        axes.fill_between(result.times, *result.bounds, color="0.88", lw=0.0)
         axes.axhline(result.dimension, color="0.5", lw=0.8)
         axes.plot(result.times, result.mean, lw=1.0)
         for name, time in marks.items():

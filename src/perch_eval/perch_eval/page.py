@@ -5,7 +5,9 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Iterable, Sequence
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -15,6 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH = 640  # of a picture in a grid, at most [px]
+UNITS = {"per_s": "per s", "s": "s", "ms": "ms", "hz": "Hz", "deg": "deg", "percent": "%", "m": "m", "px": "px"}  # in names of figures
+_UNIT = re.compile(rf"_({'|'.join(UNITS)})(?=_| |$)")
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222; }
 h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; border-bottom: 1px solid #ddd; }
@@ -64,6 +68,26 @@ def table(rows: Iterable[Sequence[Any]], head: Sequence[Any] = (), classes: Sequ
              + "".join(f"<td>{text(cell)}</td>" for cell in row[1:]) + "</tr>" for k, row in enumerate(rows)]
     first = f"<tr>{''.join(f'<th>{text(cell)}</th>' for cell in head)}</tr>" if head else ""
     return f"<table>{first}{''.join(lines)}</table>" if lines else ""
+
+
+def in_words(key: str, value: float) -> tuple[str, str]:
+    """Return name and value of a figure, the latter with the unit that is part of its key, as in `path_m`."""
+    unit, whole = _UNIT.search(key), float(value).is_integer()
+    return _UNIT.sub("", key).replace("_", " "), f"{f'{value:.0f}' if whole else f'{value:.4g}'}{f' {UNITS[unit[1]]}' if unit else ''}"
+
+
+def figure_rows(figures: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Return figures, also those in mappings, as rows of a table: finite numbers, and texts (one or a list) that are not empty."""
+    rows: list[tuple[str, str]] = []
+    for key, value in figures.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            rows += figure_rows(value, f"{name} ")
+        elif isinstance(value, (str, list)):
+            rows += [(name.replace("_", " "), one) for one in ([value] if isinstance(value, str) else value) if one]
+        elif math.isfinite(value):
+            rows.append(in_words(name, value))
+    return rows
 
 
 def image(figure: Figure | None, title: str = "") -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,7 +25,7 @@ from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.measures import InspectionResult, recorded_inspection
 from perch_eval.margins import margin_text, margins
 from perch_eval.metrics import DURATION, diagnostics, flight_metrics, missed_deadlines, node_durations, rates
-from perch_eval.page import Html, image, page, section, table, text
+from perch_eval.page import Html, image, in_words, page, section, table, text
 from perch_eval.revision import code_version, command_line
 from perch_eval.ros.recorded_flight import RecordedFlight
 from perch_eval.scene_3d import scene_3d
@@ -62,7 +61,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
         "simulated_time_s": end_time, "simulated_duration_s": end_time - start_time, "wall_time_s": wall_time,
         "real_time_factor": (end_time - start_time) / wall_time if wall_time > 0 else math.nan,
         **flight_metrics(flight, end_time),
-        "flight_hash": flight.digest(end_time), "margins": [one.mapping() for one in margins(flight, vehicle, scenario)],
+        "flight_hash": flight.digest(end_time), "margins": margins(flight, vehicle, scenario),
         "rates_hz": rates(flight), "timings_ms": node_durations(flight),
         "missed_deadlines": missed_deadlines(flight), "recording_damage": flight.damage,
     }
@@ -83,9 +82,7 @@ def build_report(folder: Path, scenario: Scenario, seed: int, outcome: str, mess
     return report
 
 
-UNITS = {"per_s": "per s", "s": "s", "hz": "Hz", "deg": "deg", "percent": "%"}  # in names of diagnostics
 WHOLE_FLIGHT = ("time_s", "real_time_factor")  # diagnostics that the report has elsewhere
-_UNIT = re.compile(rf"_({'|'.join(UNITS)})(?=_|$)")
 
 
 def _timeline(flight: Flight) -> list[tuple[float, str]]:
@@ -113,15 +110,9 @@ def _timeline(flight: Flight) -> list[tuple[float, str]]:
 def last_diagnostics(flight: Flight) -> list[tuple[str, str]]:
     """Return the last diagnostics of each node in words, without what the page has for the whole flight: durations, the vehicle's time
     and its real-time factor. Nodes that report nothing else are left out."""
-    rows = [(node, ", ".join(_with_unit(k, v) for k, v in reports[-1].items() if k not in WHOLE_FLIGHT and not DURATION.search(k)))
+    rows = [(node, ", ".join(" ".join(in_words(k, v)) for k, v in reports[-1].items() if k not in WHOLE_FLIGHT and not DURATION.search(k)))
             for node, reports in diagnostics(flight).items()]
     return [(node, words) for node, words in rows if words]
-
-
-def _with_unit(key: str, value: float) -> str:
-    """Return a diagnostics value in words, with the unit that is part of its name."""
-    unit, whole = _UNIT.search(key), float(value).is_integer()
-    return f"{_UNIT.sub('', key).replace('_', ' ')} {f'{value:.0f}' if whole else f'{value:.4g}'}{f' {UNITS[unit[1]]}' if unit else ''}"
 
 
 def _centimetres(values: Any) -> str:
@@ -185,7 +176,7 @@ def _page(flight: Flight, scenario: Scenario, report: dict[str, Any], vehicle: V
     with suppress(PerchError):
         view = FlightView.from_flight(flight, vehicle, scenario.name, until=report["simulated_time_s"])
     good = "good" if report["cause"] == SUCCESS else "bad"
-    timings = [(node, ", ".join(f"{k.replace('_ms', '').replace('_', ' ')} {v:.3g} ms" for k, v in values.items()))
+    timings = [(node, ", ".join(" ".join(in_words(k, v)) for k, v in values.items()))
                for node, values in report["timings_ms"].items()]
     margin_rows = [(m["name"], margin_text(m)) for m in report["margins"]]
     flown = [("scenario", f"{scenario.name}: {scenario.description}"), ("vehicle", report["vehicle"]), ("seed", report["seed"]),

@@ -15,7 +15,7 @@ from perch_core.values import EstimatorHealth, ImuSample, InertialState, Odometr
 from perch_perception.estimators import EstimatorConfig
 from perch_perception.imu_intake import ImuIntake
 from perch_perception.sensor_file import imu_noise
-from perch_perception.ukf import Estimate, Estimator, VioOutcome, VioPose
+from perch_perception.ukf import Estimator, VioOutcome, VioPose
 from perch_perception.ukf.estimator import COVARIANCE_STRIDE
 from perch_perception.ukf.imu_buffer import ImuOutcome
 from perch_perception.ukf.odometry import covariances, pose_of, state_of
@@ -34,6 +34,9 @@ class StateEstimator(Component[EstimatorConfig]):
     """Publishes `odometry` at the stamp of each IMU sample, from the VIO measurements so far; none before VIO's first pose.
 
     VIO's odometry is ignored while VIO's full state is available: it would add nothing.
+
+    Attributes:
+        filter: estimator behind the ports.
     """
 
     config_type = EstimatorConfig
@@ -53,7 +56,7 @@ class StateEstimator(Component[EstimatorConfig]):
 
     def _begin(self) -> None:
         """Reset to the state before the first sample."""
-        self._estimator = Estimator(self.config)
+        self.filter = Estimator(self.config)
         self._pending: list[tuple[int, bool, VioPose]] = []  # (stamp, odometry rather than a state, pose)
         self._newest_state = _NEVER
         self._covariances = (np.zeros((6, 6)), np.zeros((6, 6)))
@@ -75,7 +78,7 @@ class StateEstimator(Component[EstimatorConfig]):
 
     def on_rotors(self, rotors: RotorState) -> None:
         """Take the state of the rotors: where they stand, a vehicle with a quiet IMU rests."""
-        self._estimator.add_rotors(rotors)
+        self.filter.add_rotors(rotors)
 
     def on_imu(self, sample: ImuSample) -> None:
         """Apply the pending VIO measurements, propagate the state to the sample's stamp, and publish it."""
@@ -86,12 +89,12 @@ class StateEstimator(Component[EstimatorConfig]):
             self._begin()
         if self._pending:
             self._use_vio()
-        outcome = self._estimator.add_imu(taken)
+        outcome = self.filter.add_imu(taken)
         if outcome is not ImuOutcome.USED:
             self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
-        estimate = self._estimator.estimate
-        if estimate is not None:
-            self._emit(sample.stamp, estimate)
+        motion = self.filter.motion
+        if motion is not None:
+            self._emit(sample.stamp, motion)
         if self._first is None:
             if not outcome.used:
                 return
@@ -99,7 +102,7 @@ class StateEstimator(Component[EstimatorConfig]):
         since = sample.stamp - self._first
         if since >= self._statuses * STATUS_PERIOD:
             self._statuses = since // STATUS_PERIOD + 1
-            self._emit_status(sample.stamp, estimate)
+            self._emit_status(sample.stamp)
         if since >= self._diagnoses * DIAGNOSTICS_PERIOD + DIAGNOSTICS_PHASE:
             self._diagnoses = (since - DIAGNOSTICS_PHASE) // DIAGNOSTICS_PERIOD + 1
             self._diagnose(sample.stamp)
@@ -125,30 +128,29 @@ class StateEstimator(Component[EstimatorConfig]):
         for stamp, is_odometry, pose in pending:
             if is_odometry and stamp <= self._newest_state + STATE_VALIDITY:
                 continue
-            outcome = self._estimator.add_vio(pose)
+            outcome = self.filter.add_vio(pose)
             if not is_odometry and (outcome.used or outcome is VioOutcome.DUPLICATE):
                 self._newest_state = stamp
             self._covariance_age = COVARIANCE_STRIDE
             if outcome not in (VioOutcome.STARTED, VioOutcome.APPLIED, VioOutcome.WAITING, VioOutcome.NO_IMU):
                 self.warn(f"{'vio/odometry' if is_odometry else 'vio/state'}: at {stamp} ns {outcome.value}", 1.0)
 
-    def _emit(self, stamp: int, e: Estimate) -> None:
-        if self._covariance_age >= COVARIANCE_STRIDE:
-            self._covariances = covariances(so3.quat_to_matrix(e.q_WB), e.v_WB, e.P, self._estimator.gyro_sigma)
+    def _emit(self, stamp: int, motion: tuple[float, ...]) -> None:
+        if self._covariance_age >= COVARIANCE_STRIDE and (e := self.filter.estimate) is not None:
+            self._covariances = covariances(so3.quat_to_matrix(e.q_WB), e.v_WB, e.P, self.filter.gyro_sigma)
             self._covariance_age = 0
         self._covariance_age += 1
-        q_WB = tuple(e.q_WB.tolist())
-        self.odometry(OdometryState(stamp, tuple(e.p_WB.tolist()), q_WB, rotated(q_WB, e.v_WB.tolist(), -1.0), tuple(e.w_WB_B.tolist()),
-                                    *self._covariances, MAP))
+        p_WB, v_WB, q_WB, w_B = motion[0:3], motion[3:6], motion[6:10], motion[10:13]
+        self.odometry(OdometryState(stamp, p_WB, q_WB, rotated(q_WB, v_WB, -1.0), w_B, *self._covariances, MAP))
 
-    def _emit_status(self, stamp: int, e: Estimate | None) -> None:
-        s = self._estimator.status
+    def _emit_status(self, stamp: int) -> None:
+        s, e = self.filter.status, self.filter.estimate
         biases = ((0.0, 0.0, 0.0),) * 2 if e is None else (tuple(e.gyro_bias.tolist()), tuple(e.accel_bias.tolist()))
         self.status(EstimatorHealth(stamp, s.health.value, s.vio_age, s.accepted, s.rejected, s.nis, *biases,
                                     s.position_sigma, s.attitude_sigma, s.message))
 
     def _diagnose(self, stamp: int) -> None:
-        s = self._estimator.status
+        s = self.filter.status
         level = 0 if s.health.name == "RUNNING" else 2 if s.health.name == "DIVERGED" else 1
         self.diagnostics(Diagnostics(stamp, {"state": s.health.name, "vio_age_s": s.vio_age, "updates_accepted": s.accepted,
                                              "updates_rejected": s.rejected, "covariance_failures": s.broken}, level, s.message))

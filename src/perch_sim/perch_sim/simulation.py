@@ -71,7 +71,7 @@ class Simulation:
         self.plant = Plant(scenario, self.vehicle, seed, START)
         self.motors, self._starts = Motors(self.vehicle.speed_min, self.vehicle.speed_max, MOTOR_TIMEOUT), 0
         self.loop = inner_loop(self.vehicle, scenario.disturbance.loop_lag_factor, scenario.disturbance.voltage_factor)
-        self._imu = Imu(true_imu(self.vehicle.imu, seed), seeding.stream(seed, "imu"))
+        self.imu = Imu(true_imu(self.vehicle.imu, seed), seeding.stream(seed, "imu"))
         self._sample = ImuSample(np.array([0.0, 0.0, GRAVITY]), np.zeros(3))
         self._history = StateHistory(MEMORY * SUBSTEPS // CONTROL_PERIOD_NS)
         self._history.append(self.plant.state)
@@ -112,7 +112,7 @@ class Simulation:
             self._history.append(state)
         for camera in self.cameras.values():
             camera.expose(self.time, self._history)
-        self._sample = self._imu.sample(result.inertial)
+        self._sample = self.imu.sample(result.inertial)
         return Output(self.time, self._sample, result.states[-1], result.contacts)
 
     def _target_speeds(self) -> np.ndarray:

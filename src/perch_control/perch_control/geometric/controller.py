@@ -44,7 +44,11 @@ def packed_vehicle(vehicle: Vehicle) -> tuple:
 
 
 class GeometricController(Law):
-    """Geometric tracking on SE(3) with rotor lead and prioritised saturation. [M:eq2]"""
+    """Geometric tracking on SE(3) with rotor lead and prioritised saturation. [M:eq2]
+
+    Attributes:
+        lag: lag of the rotors behind their wanted speeds; state and reference are evaluated this far ahead [s].
+    """
 
     name = "geometric"
 
@@ -56,17 +60,13 @@ class GeometricController(Law):
         self._cone = tan(radians(CONE_DEG))
         self._settling = SETTLING * 2.0 / min(gains.rate[:2])  # an error of the tilt decays as exp(-rate t / 2)
         self._rate_max = RATE_RESERVE * vehicle.body_rate_max
+        self.set_period(self.period)
         self.step((0.0,) * 9 + (1.0, 0.0, 0.0, 0.0), (0.0,) * 16 + (1.0,) + (0.0,) * 16, RotorEstimate.at_idle(vehicle))
 
     @classmethod
     def build(cls, vehicle: Vehicle, params: ControllerParameters) -> GeometricController:
         """Build the law with the gains of the parameters."""
         return cls(vehicle, params.gain_set)
-
-    @property
-    def lag(self) -> float:
-        """Lag of the rotors behind their wanted speeds; state and reference are evaluated this far ahead [s]."""
-        return lag_behind(self.vehicle.motor_time_constant, self.gains.lead, self.period)
 
     def control(self, state: tuple[float, ...], reference: Following, rotors: RotorEstimate,
                 compensation: tuple[float, ...] = NO_COMPENSATION, time_to_contact: float = np.inf) -> ControlOutput:
@@ -91,6 +91,10 @@ class GeometricController(Law):
 
     def _limits(self, cone: float) -> tuple[float, ...]:
         return (FEEDBACK_MAX, cone, THRUST_FLOOR, self._rate_max, ACCELERATION_MAX)
+
+    def set_period(self, period: float) -> None:
+        """As in the base class."""
+        self.period, self.lag = period, lag_behind(self.vehicle.motor_time_constant, self.gains.lead, period)
 
     def set_vehicle(self, vehicle: Vehicle) -> None:
         """Use a vehicle model that differs from the initial one in its thrust."""

@@ -7,7 +7,7 @@ from perch_core.vector3 import axes_of, axpy, cross, dot, scale, times, turned
 from perch_core.vehicle import GRAVITY
 from perch_control.allocation import allocate
 from perch_control.geometric.law import geometric_step
-from perch_control.rotor_lag import approached, lag_share, leading_command, reachable, thrusts
+from perch_control.rotor_lag import followed, lag_share, leading_command, reachable, thrusts
 
 
 @compiled
@@ -68,7 +68,7 @@ def drag_compensation(q, v, drag, extra):
 def predicted_with_lag(state, speed, command, extra, duration, vehicle):
     """As `predicted`, under rotor drag and the thrusts that the rotors have in the middle of the time; arguments as in `control_step`."""
     coefficient, _, _, tau = vehicle[1]
-    f = thrusts(approached(speed, command, lag_share(0.5 * duration, tau)), coefficient)
+    f = thrusts(followed(speed, command, 0.5 * duration, tau), coefficient)
     with_drag = drag_compensation(state[6:10], state[3:6], vehicle[4], extra)
     return predicted(state, f, with_drag, duration, vehicle[0][0], vehicle[0][1:4], vehicle[2])
 

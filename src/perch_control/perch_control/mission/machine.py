@@ -40,8 +40,6 @@ class MissionMachine(ABC):
     """Message while no target is detected."""
     target_channel = "target/pose"
     """Channel of the target: this one, or `powerlines`."""
-    unless = ""
-    """Follows "cancelled too late" where the running plan ends in a recovery of its own; empty: it ends at the contact."""
 
     def __init__(self, settings: MissionSettings, ids: Iterator[int] | None = None, moves: Moves | None = None) -> None:
         """
@@ -102,6 +100,10 @@ class MissionMachine(ABC):
     def committed(self, time: float) -> str:
         """Return why no way out of the running plan is left at a time [s]; empty: there is one, or no plan."""
         return ""
+
+    def cancelled_too_late(self, inputs: Inputs, outputs: Outputs) -> None:
+        """Act on a cancellation when no way out of the running plan is left: the plan, which ends at the contact, is flown."""
+        self.message = f"cancelled too late: {self._too_late}"
 
     def holds(self, inputs: Inputs) -> bool:
         """Whether the target holds the vehicle after all, during a recovery."""
@@ -288,12 +290,15 @@ class MissionMachine(ABC):
             self._end(outputs, Result.CANCELLED, "cancelled on the ground")
         else:
             self._too_late = self.committed(inputs.time)
-            if self.unless or not self._too_late:
-                if inputs.controller is not ControllerState.LANDING:
-                    outputs.commands.append((Command.HOVER, "cancelled"))
-                self._fail_attempt(inputs, "cancelled")
             if self._too_late:
-                self.message = f"cancelled too late{self.unless}: {self._too_late}"
+                self.cancelled_too_late(inputs, outputs)
+            else:
+                self._cancel_to_hover(inputs, outputs)
+
+    def _cancel_to_hover(self, inputs: Inputs, outputs: Outputs) -> None:
+        if inputs.controller is not ControllerState.LANDING:
+            outputs.commands.append((Command.HOVER, "cancelled"))
+        self._fail_attempt(inputs, "cancelled")
 
     def _end(self, outputs: Outputs, result: Result, message: str, contact_time: float = float("nan")) -> None:
         outputs.outcome = Outcome(result, message, contact_time)

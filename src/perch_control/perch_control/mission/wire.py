@@ -35,8 +35,6 @@ class LineMission(MissionMachine):
 class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
     """Map the lines, plan a perch with its recovery, fly it with ways out kept ready."""
 
-    unless = ", unless the gripper fails"
-
     @property
     def legs(self) -> int:
         """Number of moves of the pattern that are flown before any plan."""
@@ -71,6 +69,11 @@ class PowerlineMission(LineMission, PerchingMission[RunningPlan]):
             self._running = shifted
             outputs.perch, outputs.trajectory_id = shifted.plan, self._flown_id
         outputs.query = self._running.query(inputs.time, inputs.state, target, self._goal)
+
+    def cancelled_too_late(self, inputs: Inputs, outputs: Outputs) -> None:
+        """As in the base class; but a hover is commanded, too: the plan's own recovery leads to it where the gripper fails."""
+        self._cancel_to_hover(inputs, outputs)
+        self.message = f"cancelled too late, unless the gripper fails: {self._too_late}"
 
     def contact_awaited(self, inputs: Inputs, outputs: Outputs) -> bool:
         """Whether the contact is still awaited. Ways out are requested until the plan continues into its own recovery."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 from perch_core.component import Action, Client, Component, Input, Service, Timer, ports
 from perch_core.jit import load_cached
@@ -18,7 +18,7 @@ from perch_core.ros.intake import Intake
 from perch_core.ros.priority import priority
 from perch_core.ros.service_clients import Send, connect_clients
 from perch_core.ros.wiring import Wiring, foreign_publishers
-from rclpy.clock import Clock, ClockType, ROSClock
+from rclpy.clock import Clock, ClockType
 from rclpy.timer import Timer as RosTimer
 
 CHECK_PERIOD = 1.0  # of the check for foreign publishers, whose messages are ignored [s]
@@ -59,17 +59,20 @@ class ArrivalNode(ComponentNode):
         handler = partial(self.guarded, port.name, port.handler(self.component))
 
         def call() -> None:
-            self._intake.enter(handler, self.host_time() if port.stamping else self._due_time(timer))
+            self._intake.enter(handler, self.host_time() if port.stamping else self._due_time(timer, period))
 
         timer: RosTimer = self.create_timer(port.period, call, clock=self._steady)
+        period = timer.timer_period_ns
 
-    def _due_time(self, timer: RosTimer) -> int:
-        """Return simulation time once it is received; otherwise when a timer's present call was due [ns].
+    def _due_time(self, timer: RosTimer, period: int) -> int:
+        """Return simulation time once it is received; otherwise when the present call of a timer with this period was due [ns].
 
         The latter is a monotonic time, which goes on where the system's clock is set.
         """
-        simulated = self.host_time() if cast(ROSClock, self.get_clock()).ros_time_is_active else 0
-        return simulated or time.monotonic_ns() + self._steady_offset + timer.time_until_next_call() - timer.timer_period_ns
+        clock = self.get_clock().handle
+        with clock:
+            simulated = int(clock.get_now().nanoseconds) if clock.get_ros_time_override_is_enabled() else 0
+        return simulated or time.monotonic_ns() + self._steady_offset + timer.time_until_next_call() - period
 
     def _warn_foreign_publishers(self) -> None:
         """Warn once of each foreign publisher on a topic that a neighbour publishes: its messages are ignored."""

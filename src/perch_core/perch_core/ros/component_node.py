@@ -146,7 +146,7 @@ class ComponentNode(Node):
                 self.get_logger().warning(f"{error}: not published")
                 continue
             publisher = self.create_publisher(row.message, channel, row.qos.publish)
-            publication = Publication(publisher, row.to_message, row.latched, self.log_refusal, row.packed, row.observed)
+            publication = Publication(publisher, row.to_message, row.latched, self.log_refusal, row.frequent, row.observed)
             emitter = getattr(self.component, port.name)
             self.wiring.register_writer(publisher.topic_name, self.get_fully_qualified_name())
             emitter.receivers.append(self._emit_function(publisher.topic_name, publication))

@@ -54,7 +54,7 @@ class Topic:
         observed: no component in flight waits for it.
         size_max: greatest size of a message that is read [bytes].
         rate_max: greatest number of messages per second that a node reads; 0: no limit.
-        packed: `to_message` returns the serialised message and `to_value` reads it, without rclpy's objects, for topics at 500 Hz.
+        packed: `to_message` returns the serialised message and `to_value` reads it, without rclpy's objects: frequent topics and images.
         """
 
     channel: str
@@ -84,6 +84,11 @@ class Topic:
         return self.to_value(message)
 
     @property
+    def frequent(self) -> bool:
+        """Whether its messages are so many that one wake-up of a reader serves several."""
+        return self.packed and self.message is not Image
+
+    @property
     def latched(self) -> bool:
         """Whether late subscribers receive messages that were published before."""
         return bool(self.qos.publish.durability == DurabilityPolicy.TRANSIENT_LOCAL)
@@ -91,11 +96,11 @@ class Topic:
 
 TOPICS = (
     Topic("imu/data_raw", Imu, qos.SENSOR, fast.pack_imu, fast.unpack_imu, packed=True),
-    Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.image_message, sensing.image_value, size_max=IMAGE_MAX, rate_max=300),
+    Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.pack_image, sensing.unpack_image, packed=True, size_max=IMAGE_MAX, rate_max=300),
     Topic("camera_*/image_raw/compressed", CompressedImage, qos.IMAGE, sensing.compressed_message, sensing.compressed_value, size_max=IMAGE_MAX,
           rate_max=300),
     Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value, rate_max=300),
-    Topic("vio/debug_image", Image, qos.IMAGE, sensing.image_message, sensing.image_value, size_max=IMAGE_MAX),
+    Topic("vio/debug_image", Image, qos.IMAGE, sensing.pack_image, sensing.unpack_image, packed=True, size_max=IMAGE_MAX),
     Topic("vio/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
     Topic("vio/state", VioState, qos.SENSOR, states.inertial_message, states.inertial_value),
     Topic("odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
@@ -111,7 +116,7 @@ TOPICS = (
     Topic("motor_command", MotorCommand, qos.SENSOR, fast.pack_motor, fast.unpack_motor, packed=True),
     Topic("rates_thrust_command", RatesThrust, qos.SENSOR, fast.pack_rates, fast.unpack_rates, packed=True),
     Topic("attitude_thrust_command", AttitudeThrust, qos.SENSOR, fast.pack_attitude, fast.unpack_attitude, packed=True),
-    Topic("rotor_state", RotorState, qos.SENSOR, states.rotors_message, states.rotors_value, observed=True),
+    Topic("rotor_state", RotorState, qos.SENSOR, fast.pack_rotors, fast.unpack_rotors, packed=True, observed=True),
     Topic("contact", Contact, qos.EVENT, states.contact_message, states.contact_value),
     Topic("ground_truth/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True, observed=True),
     Topic("ground_truth/target", PoseStamped, qos.LATCHED, states.pose_message, states.pose_value),

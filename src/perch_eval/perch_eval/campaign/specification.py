@@ -1,4 +1,4 @@
-"""Specification of a campaign: a scenario, the varied quantities and the number of runs; a YAML file in `config/campaigns/`.
+"""Specification of a campaign: a scenario, distributions of varied quantities, number of runs; a file in `config/campaigns/`.
 
 A varied name is a field of the scenario (`target.distance`, `wind.gust_sigma`), an entry of one of its vectors
 (`wind.steady.0`), or a node's parameter (`parameters.controller.gains.lead`). `seed` can be varied by a grid, too.
@@ -6,7 +6,6 @@ A varied name is a field of the scenario (`target.distance`, `wind.gust_sigma`),
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import itertools
 import json
@@ -19,19 +18,51 @@ from typing import Any
 import numpy as np
 
 from perch_core import config
-from perch_core.config import choice, label, part, quantity, text
+from perch_core.config import FALLBACK_BOUND, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.extends import FILES, extended_mapping
 from perch_core.vehicle import Vehicle
-from perch_eval.campaign.distributions import LARGEST_SEED, Distribution, parse, parse_seed
 from perch_eval.flyable import check_flight, check_names
 from perch_eval.in_process import Sensing
 from perch_eval.in_process.parameters import check_parameters
 from perch_sim.scenario import Scenario
 
-
+LARGEST_SEED = 2**31 - 1
 RUNS_MAX = 20_000
 """Largest number of runs of a campaign, over all points of its grids."""
+KINDS = ("choice", "uniform", "normal", "grid")
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Distribution of one varied quantity.
+
+    Attributes:
+        kind: one of `KINDS`.
+        values: choices, grid values, (low, high) of a uniform, or (mean, sigma) of a normal distribution.
+        low, high: limits of a normal distribution; values outside are drawn again.
+    """
+
+    kind: str
+    values: tuple[Any, ...]
+    low: float = -np.inf
+    high: float = np.inf
+
+    def __str__(self) -> str:
+        limits = f", within [{self.low:g}, {self.high:g}]" if np.isfinite([self.low, self.high]).any() else ""
+        return f"{self.kind} {list(self.values)}{limits}"
+
+    def draw(self, rng: np.random.Generator) -> Any:
+        """Draw one value; not for grids, whose values are all flown."""
+        if self.kind == "choice":
+            return self.values[int(rng.integers(len(self.values)))]
+        if self.kind == "uniform":
+            return float(rng.uniform(*self.values))
+        for _ in range(1000):
+            value = float(rng.normal(*self.values))
+            if self.low <= value <= self.high:
+                return value
+        raise ConfigError("campaign", "normal", f"[{self.low:g}, {self.high:g}] is almost never drawn by normal{self.values}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,10 +118,11 @@ class Campaign:
 
     def mapping(self, run: Run) -> dict[str, Any]:
         """Return the scenario's mapping for a run, in the form of a scenario file."""
-        out = copy.deepcopy(self.base)
+        flat = config.flattened(self.base)
         for name, value in run.values.items():
-            set_value(out, name, config.beside(self.file, value) if name in FILES["scenarios"] else value)
-        return out
+            name, value = _field(flat, name, config.beside(self.file, value) if name in FILES["scenarios"] else value)
+            flat[name] = list(value) if isinstance(value, tuple) else value
+        return config.nested(flat)
 
 
 def load_campaign(path: Path | str, engine: str | None = None, runs: int | None = None) -> Campaign:
@@ -107,7 +139,8 @@ def load_campaign(path: Path | str, engine: str | None = None, runs: int | None 
     file = config.find("campaigns", path)
     content = config.load(_File, file)
     base = extended_mapping("scenarios", config.beside(file, content.scenario))
-    vary = {name: (parse_seed if name == "seed" else parse)(str(file), f"vary.{name}", entry) for name, entry in (content.vary or {}).items()}
+    vary = {name: (parse_seed if name == "seed" else parse_distribution)(str(file), f"vary.{name}", entry)
+            for name, entry in (content.vary or {}).items()}
     mappable = [name for name in vary if name != "seed"]  # one run a seed: no rate
     for axis in content.map:
         if axis not in mappable:
@@ -153,41 +186,17 @@ def _check(campaign: Campaign, file: str) -> list[dict[str, Any]]:
     return [extended_mapping("vehicles", vehicle) | {"board": config.read_yaml(config.find("boards", board))} for vehicle, board, _ in vehicles]
 
 
-def set_value(mapping: dict[str, Any], name: str, value: Any) -> None:
-    """Set a dotted name in a scenario's mapping; a number as last part is an index into a vector."""
-    *groups, leaf = name.split(".")
-    value = list(value) if isinstance(value, tuple) else value
-    if groups[:1] == ["parameters"] and len(groups) >= 2:
-        _group(mapping, groups[:2])[".".join((*groups[2:], leaf))] = value
-    elif groups and leaf.isascii() and leaf.isdigit():
-        *outer, vector = groups
-        target = _group(mapping, outer)
-        entries = target.get(vector, _default(groups))
-        if not isinstance(entries, list):
-            raise ConfigError("campaign", f"vary.{name}", f"{vector} is not a vector")
-        if int(leaf) >= len(entries):
-            raise ConfigError("campaign", f"vary.{name}", f"{vector} has {len(entries)} entries")
-        target[vector] = [*entries[:int(leaf)], value, *entries[int(leaf) + 1:]]
-    else:
-        _group(mapping, groups)[leaf] = value
-
-
-def _default(groups: list[str]) -> Any:
-    """Return the default value of a scenario's field, vectors as lists."""
-    value: Any = Scenario(name="defaults")
-    for group in groups:
-        value = getattr(value, group, None)
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _group(mapping: dict[str, Any], groups: list[str]) -> dict[str, Any]:
-    for group in groups:
-        if mapping.get(group) is None:
-            mapping[group] = {}
-        mapping = mapping[group]
-        if not isinstance(mapping, dict):
-            raise ConfigError("campaign", f"vary.{'.'.join(groups)}", f"{group} is a value, not a group")
-    return mapping
+def _field(flat: Mapping[str, Any], name: str, value: Any) -> tuple[str, Any]:
+    """Return name and value of the scenario field that a varied name sets: itself, or the vector of an entry. `flat`: dotted names."""
+    vector, _, index = name.rpartition(".")
+    if not (index.isascii() and index.isdigit()) or name.startswith("parameters."):
+        return name, value
+    entries = flat.get(vector, config.flattened(asdict(Scenario(name="defaults"))).get(vector))
+    if not isinstance(entries, list):
+        raise ConfigError("campaign", f"vary.{name}", f"{vector.rpartition('.')[2]} is not a vector")
+    if int(index) >= len(entries):
+        raise ConfigError("campaign", f"vary.{name}", f"{vector.rpartition('.')[2]} has {len(entries)} entries")
+    return vector, [*entries[:int(index)], value, *entries[int(index) + 1:]]
 
 
 def _draw(vary: Mapping[str, Distribution], runs: int, seed: int) -> tuple[Run, ...]:
@@ -216,3 +225,58 @@ def _draw(vary: Mapping[str, Distribution], runs: int, seed: int) -> tuple[Run, 
 def values_text(values: Mapping[str, Any]) -> str:
     """Return varied values as text."""
     return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
+
+
+def parse_distribution(source: str, key: str, entry: Any) -> Distribution:
+    """Parse a distribution from an entry of a campaign file such as `{uniform: [0.8, 3.0]}`.
+
+    Raises:
+        ConfigError: the entry is not a valid distribution.
+    """
+    if not isinstance(entry, Mapping):
+        raise ConfigError(source, key, f"{entry!r} is not a mapping such as {{uniform: [0.8, 3.0]}}")
+    kinds = [kind for kind in KINDS if kind in entry]
+    extra = set(entry) - set(KINDS) - ({"low", "high"} if kinds == ["normal"] else set())
+    if len(kinds) != 1 or extra:
+        raise ConfigError(source, key, f"{dict(entry)!r} needs exactly one of {', '.join(KINDS)}"
+                          " (normal may have low and high)")
+    kind, values = kinds[0], entry[kinds[0]]
+    if not isinstance(values, list) or not values:
+        raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not a list")
+    if len({_kind(v) for v in values}) > 1 or "" in map(_kind, values):
+        raise ConfigError(source, f"{key}.{kind}", f"{values!r} are not all numbers (of at most {FALLBACK_BOUND:g}), words, true or false, or vectors")
+    if kind in ("uniform", "normal"):
+        if len(values) != 2 or not all(_is_number(v) for v in values):
+            raise ConfigError(source, f"{key}.{kind}", f"{values!r} is not two numbers of at most {FALLBACK_BOUND:g}")
+        if kind == "uniform" and not values[0] < values[1]:
+            raise ConfigError(source, f"{key}.uniform", f"{values[0]} is not below {values[1]}")
+        if kind == "normal" and not values[1] > 0:
+            raise ConfigError(source, f"{key}.normal", f"sigma {values[1]} is not > 0")
+    limits = {name: entry[name] for name in ("low", "high") if name in entry}
+    for name, value in limits.items():
+        if not _is_number(value):
+            raise ConfigError(source, f"{key}.{name}", f"{value!r} is not a number of at most {FALLBACK_BOUND:g}")
+    return Distribution(kind, tuple(tuple(v) if isinstance(v, list) else v for v in values), **limits)
+
+
+def parse_seed(source: str, key: str, entry: Any) -> Distribution:
+    """Parse the distribution of the flights' seeds: a grid or a choice.
+
+    Raises:
+        ConfigError: another distribution, or values other than integers in the range of seeds.
+    """
+    found = parse_distribution(source, key, entry)
+    if found.kind not in ("grid", "choice") or not all(type(v) is int and 0 <= v <= LARGEST_SEED for v in found.values):
+        raise ConfigError(source, key, f"{entry!r} is not a grid or choice of whole numbers in [0, {LARGEST_SEED}]")
+    return found
+
+
+def _kind(value: Any) -> str:
+    """Return the kind of a value, which all values of a quantity must share; empty: the value is not permitted."""
+    if isinstance(value, list):
+        return f"{len(value)} numbers" if value and all(map(_is_number, value)) else ""
+    return "number" if _is_number(value) else type(value).__name__ if isinstance(value, (str, bool)) else ""
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= FALLBACK_BOUND

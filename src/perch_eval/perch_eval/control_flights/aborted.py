@@ -9,13 +9,13 @@ import numpy as np
 
 from perch_core.values import NANOSECONDS, ControllerStatus, PerchResult, seconds
 from perch_control.modes import State
+from perch_eval.ending import simulated_ending
 from perch_eval.goal import goal_of
 from perch_eval.in_process import Sensing, arrange
 from perch_sim.scenario import load_scenario
 
 LIMIT = 60 * NANOSECONDS   # for the whole flight [ns]
 LINGER = NANOSECONDS // 2  # flown on after the goal's end [ns]
-MAX_HOVER_SPEED = 0.3      # [m/s]
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class CancelledFlight:
         scenario, seed: name of the scenario, and seed of the flight.
         before: time of the cancellation before the planned contact [s].
         planned: whether the vehicle left the plan by a planned way out.
-        end: true end: never cancelled, broken (crashed), attached or hovering; otherwise the controller's state.
+        end: true end, `attached` on the target, or that it was never cancelled.
         perched: whether the mission reports a perch: the goal was cancelled too late.
         message: message of the mission's result.
         rate: largest body rate after the cancellation [rad/s].
@@ -71,11 +71,8 @@ def fly_cancelled(scenario: str, seed: int, before: float) -> CancelledFlight:
                 distance = min(distance, float((x.p_WB - pad.p_WS) @ pad.normal))
                 ended = ended or (stamp if goal.result is not None else 0)
     statuses: list[ControllerStatus] = [s for s in loop.trace.values("controller/status") if s.stamp >= cancelled]
-    state = State(statuses[-1].state)
-    hovering = state is State.HOVERING and float(np.linalg.norm(simulation.state.v_WB)) < MAX_HOVER_SPEED
-    held = simulation.plant.contact.attached or simulation.plant.cables.hold.active
-    end = ("never cancelled" if not cancelled else "broken" if simulation.plant.crashed else "attached" if held else
-           "hovering" if hovering else state.name.lower())
+    end = simulated_ending(simulation, State(statuses[-1].state)) if cancelled else "never cancelled"
+    end = "attached" if end == "perched" else end  # `perched` is what the mission reports
     result = goal.result or PerchResult(False, 0, "no end")
     return CancelledFlight(scenario, seed, before, any("as planned" in s.message for s in statuses), end, bool(np.isfinite(result.contact_time)),
                            result.message, rate, min(s.thrust_margin for s in statuses), distance,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from perch_eval.ending import simulated_ending
 from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight, scenario_of
 
 SCENARIO = "surface_90"
@@ -65,11 +66,12 @@ def fly(controller: str, condition: str, maneuver: str, seed: int) -> tuple[np.n
 
 
 def _outcome(flight: ScriptedFlight, maneuver: str) -> str:
-    if flight.simulation.plant.crashed:
-        return "crashed"
+    end = simulated_ending(flight.simulation, flight.state)
+    if end == "crashed":
+        return end
     if maneuver == "perch":
-        if flight.simulation.plant.contact.attached:
-            return "perched"
+        if end == "perched":
+            return end
         refused = next((c.reason for c in flight.loop.trace.contacts if c.body == "pad" and c.reason), "")
         return f"missed: {refused}" if refused else f"missed, {flight.state.name.lower()}"
     return "held" if flight.state.name == "HOVERING" else flight.state.name.lower()

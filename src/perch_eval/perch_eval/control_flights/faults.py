@@ -16,6 +16,7 @@ from perch_control.modes import State
 from perch_core.errors import PerchError
 from perch_core.values import Command, OdometryState, TriggerRequest, seconds
 from perch_eval.control_flights.way_out import Search, search
+from perch_eval.ending import simulated_ending
 from perch_eval.metrics import tilt_degrees
 from perch_eval.scripted_flight import LEAD, TAKE_OFF_SPEED, ScriptedFlight, scenario_of
 from perch_sim import seeding
@@ -225,15 +226,5 @@ def _true_state(flight: ScriptedFlight) -> tuple[float, float, float, float]:
 
 
 def _end(flight: ScriptedFlight) -> str:
-    """Return the end of the flight by the true state; a hover also requires the controller's state."""
-    plant, x = flight.simulation.plant, flight.simulation.state
-    if plant.crashed:
-        return "crashed"
-    if plant.contact.attached:
-        return "perched"
-    tilt = _true_state(flight)[3]
-    if x.p_WB[2] < flight.simulation.vehicle.perch_offset + 0.02 and tilt < 20.0 and np.linalg.norm(x.v_WB) < 0.1:
-        return "landed"
-    if flight.state is State.HOVERING and np.linalg.norm(x.v_WB) < 0.5 and tilt < 20.0:
-        return "hovering"
-    return "lost"
+    end = simulated_ending(flight.simulation, flight.state)
+    return end if end in (*END_STATES, "crashed") else "lost"

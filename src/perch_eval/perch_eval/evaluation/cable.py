@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from scipy.optimize import brentq
 
 from perch_core.catenary import Catenary, fit_segments
-from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.evaluation.document import Effort, Section
 
 LENGTH, COUNT, MEAN_LENGTH, MEAN_ERROR = 185.0, 15, 12.0, 0.015
 SAG_SHARE = 0.025  # of the span: usual for distribution and transmission lines at everyday temperature

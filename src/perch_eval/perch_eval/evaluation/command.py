@@ -13,7 +13,7 @@ from pathlib import Path
 from perch_core.registry import resolved
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.evaluation import document
-from perch_eval.evaluation.sections import FAILS, MISSING, Effort, Section
+from perch_eval.evaluation.document import FAILS, MISSING, Effort, Section
 from perch_eval.revision import OtherCodeError
 
 EXAMPLES = """examples:
@@ -44,9 +44,7 @@ BEYOND_PAPERS = ("c_faults", "c_comparison", "c_way_out", "c_contact", "c_consis
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     out = command_parser("evaluate.py", __doc__, EXAMPLES)
-    size = out.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="both papers, with few flights (default)")
-    size.add_argument("--full", action="store_true", help="every part, with many flights; resumable, but for c_consistency")
+    out.add_argument("--full", action="store_true", help="every part, with many flights; resumable")
     out.add_argument("--jobs", type=count, default=os.cpu_count() or 1, metavar="N", help="processes for flights (default: %(default)s)")
     out.add_argument("--out", type=Path, metavar="DIR", help="folder of page, figures and JSON, replaced at the end (default: docs/results with --full and "
                                                               "without --only, otherwise out/results)")
@@ -114,5 +112,4 @@ def evaluate(effort: Effort, names: list[str]) -> list[Section]:
     return sections
 
 
-main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept, except those of c_consistency: the same command "
-                                                "(without --fresh) continues")
+main = command(parser, _regenerate, interrupted="interrupted; finished flights are kept: the same command (without --fresh) continues")

@@ -10,10 +10,9 @@ from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import load_campaign
-from perch_eval.evaluation.document import table, write_page
+from perch_eval.evaluation.document import Effort, Section, table, write_page
 from perch_eval.evaluation.kept import cached_runs
 from perch_eval.evaluation.perching import perches
-from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.metrics import FIGURES
 from perch_eval.statistics import Rate, Spread
 

@@ -13,9 +13,8 @@ import numpy as np
 
 from perch_eval.control_flights.comparison import CONDITIONS, CONTROLLERS, LINE, LINE_TIME, MANEUVERS, fly
 from perch_eval.control_flights.faults import END_STATES, FAULTS, fly_fault
-from perch_eval.evaluation.document import table, write_page
+from perch_eval.evaluation.document import Effort, Section, table, write_page
 from perch_eval.evaluation.kept import cached_figures
-from perch_eval.evaluation.sections import Effort, Section
 
 GIVEN_PAD = "The pad is not localised: the planner is given its true pose, shifted by the position error of the estimate."
 MOMENTS = 20                         # of each fault

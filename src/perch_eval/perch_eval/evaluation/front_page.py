@@ -11,7 +11,7 @@ from pathlib import Path
 
 from perch_eval.evaluation import document
 from perch_eval.evaluation.powerline import POSITION
-from perch_eval.evaluation.sections import MISSING
+from perch_eval.evaluation.document import MISSING
 from perch_eval.revision import root
 
 ROWS = (

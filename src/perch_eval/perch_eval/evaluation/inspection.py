@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from perch_eval.evaluation.kept import cached_figures
-from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.evaluation.document import Effort, Section
 from perch_eval.inspection.figures import metrics_figure, paths_figure
 from perch_eval.inspection.flight import fly
 from perch_eval.inspection.layout import random_layout

@@ -16,7 +16,7 @@ from perch_eval.campaign.engines import Task, run_task
 from perch_eval.campaign.progress import with_progress
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.workers import failed_run, in_processes
-from perch_eval.evaluation.sections import Effort
+from perch_eval.evaluation.document import Effort
 from perch_eval.revision import require_code
 from perch_eval.rows import Rows, rows_of
 

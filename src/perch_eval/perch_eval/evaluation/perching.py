@@ -19,10 +19,12 @@ from perch_eval.campaign.causes import SUCCESS
 from perch_eval.campaign.engines import Task
 from perch_eval.campaign.results import RunResult
 from perch_eval.campaign.specification import Run
+from perch_eval.evaluation import consistency
+from perch_eval.evaluation.consistency import SENSING
 from perch_eval.evaluation.kept import cached_runs
-from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.evaluation.document import Effort, Section
 from perch_eval.flight_view import FlightView
-from perch_eval.in_process import Sensing, fly
+from perch_eval.in_process import fly
 from perch_eval.statistics import Rate, Spread
 from perch_sim.scenario import load_scenario
 
@@ -38,7 +40,6 @@ RMSE = {"surface_60": ((0.0500, 0.0325, 0.1509), (0.0145, 0.0851, 0.0714)),
         "surface_60_far": ((0.0378, 0.0732, 0.1321), (0.0401, 0.0714, 0.0452)),
         "surface_90": ((0.0503, 0.0539, 0.1081), (0.0314, 0.0533, 0.0405)),
         "surface_90_far": ((0.0948, 0.0360, 0.0911), (0.0660, 0.0045, 0.0485))}
-SENSING = Sensing(vio="rendered", target="rendered")
 PEAK_RATE, PEAK_ACCELERATION = 600.0, 10.0  # [deg/s], [m/s^2]
 
 
@@ -49,11 +50,13 @@ def perching_sections(effort: Effort) -> list[Section]:
 
 
 def perches(effort: Effort) -> dict[str, list[RunResult]]:
-    """Return the flights of each condition; finished flights of the same code are not repeated."""
-    jobs = enumerate(product(effort.seeds, (*CONDITIONS, AGGRESSIVE)))
+    """Return the flights of each condition; finished flights of the same code are not repeated, and those of `consistency` are shared."""
+    names = (*CONDITIONS, AGGRESSIVE)
+    jobs = enumerate(product(effort.seeds, (name for name in names if name != consistency.SCENARIO)))
     found = cached_runs(effort, "flights", [Task(Run(number, seed, {"scenario": name}), extended_mapping("scenarios", name), "in_process", SENSING)
                                       for number, (seed, name) in jobs])
-    return {name: [r for r in found if r.values["scenario"] == name] for name in (*CONDITIONS, AGGRESSIVE)}
+    shared = [run for run, _ in consistency.judged_flights(effort, effort.seeds)]
+    return {name: shared if name == consistency.SCENARIO else [r for r in found if r.values["scenario"] == name] for name in names}
 
 
 def _condition_text(name: str) -> str:

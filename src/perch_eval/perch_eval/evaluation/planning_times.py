@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from time import process_time
+from typing import Any, NamedTuple
 
+import nlopt
 import numpy as np
 from matplotlib.figure import Figure
 
 from perch_core import bernstein
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import GRAVITY, Vehicle, load_vehicle
-from perch_eval.evaluation.nonlinear import solve
-from perch_eval.evaluation.sections import Effort, Section
+from perch_eval.evaluation.document import Effort, Section
 from perch_eval.statistics import Spread
 from perch_planner import plan_checks, planner
 from perch_planner.paper import paper_m
@@ -24,6 +25,9 @@ from perch_planner.refusals import PerchRefusal
 SETTINGS = PerchSettings(thrust_max=4.5)          # [N], the paper's
 PAPER = {3: (4.0, 527.0), 10: (18.0, 1253.0)}     # waypoints -> (QP+GBC, NLOPT) [ms]
 REPETITIONS = 5  # of each problem; the fastest counts, so that other work on the machine does not
+SAMPLE = 0.01  # the thrust is bounded and drawn at every so many seconds, as the paper's dt [s]
+TOLERANCE = 1e-6  # of the nonlinear program
+TIME_LIMIT = 120.0  # of the nonlinear program [s]
 
 
 def waypoint_problem(rng: np.random.Generator, waypoints: int) -> PerchProblem:
@@ -101,8 +105,8 @@ def _figure(effort: Effort, vehicle: Vehicle) -> Section:
             continue
         durations = iteration.program.durations
         peaks.append(vehicle.mass * plan_checks.thrust_extrema(iteration.coefficients, durations, 0.0, bound / vehicle.mass)[2])
-        t, thrust = _thrust(iteration.coefficients, durations, vehicle.mass)
-        axes.plot(t, thrust, lw=1.4, label=f"{k + 1}: {t[-1]:.2f} s, peak {peaks[-1]:.2f} N")
+        t, f = specific_force(iteration.coefficients, durations)
+        axes.plot(t, vehicle.mass * np.linalg.norm(f, axis=1), lw=1.4, label=f"{k + 1}: {t[-1]:.2f} s, peak {peaks[-1]:.2f} N")
     axes.axhline(bound, color="k", lw=0.8, ls="--", label=f"bound {bound:g} N")
     axes.set(xlabel="time [s]", ylabel="thrust [N]", ylim=(0.0, min(1.05 * max(peaks), 6 * bound)))
     axes.grid(alpha=0.3)
@@ -121,12 +125,78 @@ def _figure(effort: Effort, vehicle: Vehicle) -> Section:
     return out
 
 
-def _thrust(coefficients: np.ndarray, durations: np.ndarray, mass: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and thrust [N] of the QP's solution, each of shape (n,)."""
-    times, values, begin, s = [], [], 0.0, np.linspace(0.0, 1.0, 200)
-    for segment, length in zip(coefficients, durations):
-        a = bernstein.evaluate(bernstein.derivative(segment, 2), s).T / length**2
-        times.append(begin + s * length)
-        values.append(mass * np.linalg.norm(a + np.array([0.0, 0.0, GRAVITY]), axis=1))
-        begin += length
-    return np.concatenate(times), np.concatenate(values)
+def specific_force(coefficients: np.ndarray, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s], at most `SAMPLE` apart, and the specific force there [m/s^2], shapes (n,), (n, 3)."""
+    times, forces, begin = [], [], 0.0
+    for segment, duration in zip(coefficients, durations):
+        s = np.linspace(0.0, 1.0, max(2, math.ceil(duration / SAMPLE) + 1))
+        times.append(begin + s * duration)
+        forces.append((bernstein.evaluate(bernstein.derivative(segment, 2), s) / duration**2).T + (0.0, 0.0, GRAVITY))
+        begin += duration
+    return np.concatenate(times), np.concatenate(forces)
+
+
+class NonlinearPlan(NamedTuple):
+    """Solution of the nonlinear program.
+
+    Attributes:
+        coefficients: Bernstein, shape (f, 3, degree + 1) [m].
+        thrust_max: greatest thrust at the samples [N].
+        solve_time: CPU time, which does not depend on other processes [s].
+        converged: whether the solution is within tolerances, before the time limit.
+    """
+
+    coefficients: np.ndarray
+    thrust_max: float
+    solve_time: float
+    converged: bool
+
+
+def solve(program: paper_m.Program, mass: float, thrust_max: float) -> NonlinearPlan:
+    """Solve the comparison of the paper's Table I, one nonlinear program with the thrust bounded at every sample, by NLopt's SLSQP.
+
+    The variables are the coordinates w of the paper's QP in which the equalities hold and the cost is |w|^2; with the Bernstein
+    coefficients as variables the solver is slower (8-60 s).
+
+    Args:
+        program: program from `paper_m.position_program`.
+        mass: mass of the vehicle [kg].
+        thrust_max: bound [N].
+    """
+    begin = process_time()
+    n = program.rows.shape[1]
+    base = specific_force(program.coefficients(np.zeros(n)), program.durations)[1]
+    slopes = np.stack([specific_force(program.coefficients(unit), program.durations)[1] - base for unit in np.eye(n)], axis=-1)
+    limit = (thrust_max / mass) ** 2
+    both, right = np.vstack([program.rows, -program.rows]), np.concatenate([program.upper, -program.lower])
+
+    def cost(w: np.ndarray, gradient: np.ndarray) -> float:
+        if gradient.size:
+            gradient[:] = 2.0 * w
+        return float(w @ w)
+
+    def linear_rows(result: np.ndarray, w: np.ndarray, gradient: np.ndarray) -> None:
+        if gradient.size:
+            gradient[:] = both
+        result[:] = both @ w - right
+
+    def thrust_rows(result: np.ndarray, w: np.ndarray, gradient: np.ndarray) -> None:
+        f = base + slopes @ w
+        if gradient.size:
+            gradient[:] = 2.0 * np.einsum("kd,kdn->kn", f, slopes) / limit
+        result[:] = (f**2).sum(axis=1) / limit - 1.0
+
+    solver = nlopt.opt(nlopt.LD_SLSQP, n)
+    solver.set_min_objective(cost)
+    solver.add_inequality_mconstraint(linear_rows, np.full(len(both), TOLERANCE))
+    solver.add_inequality_mconstraint(thrust_rows, np.full(len(base), TOLERANCE))
+    solver.set_ftol_rel(1e-6)
+    solver.set_maxtime(TIME_LIMIT)
+    try:
+        w = solver.optimize(np.zeros(n))
+        converged = solver.last_optimize_result() in (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
+    except (nlopt.RoundoffLimited, RuntimeError):
+        w, converged = np.zeros(n), False
+    peak = float(np.sqrt(((base + slopes @ w) ** 2).sum(axis=1).max()) * mass)
+    converged = converged and peak <= thrust_max * 1.001 and float((both @ w - right).max()) < 1e-3
+    return NonlinearPlan(program.coefficients(w), peak, process_time() - begin, converged)

@@ -17,9 +17,8 @@ from perch_core.errors import PlanningRefusal
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
 from perch_eval.control_flights.aborted import fly_cancelled
-from perch_eval.evaluation.document import table, write_page
+from perch_eval.evaluation.document import Effort, Section, table, write_page
 from perch_eval.evaluation.kept import cached_figures
-from perch_eval.evaluation.sections import Effort, Section
 from perch_eval.in_process.parameters import NodeParameters
 from perch_eval.statistics import Rate
 from perch_planner.perching_planner import PerchingPlannerParameters

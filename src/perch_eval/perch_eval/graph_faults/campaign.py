@@ -17,8 +17,9 @@ from perch_core.errors import PerchError
 from perch_eval.arguments import command, command_parser, count, output_folder
 from perch_eval.campaign.progress import Progress
 from perch_eval.campaign.workers import in_processes
+from perch_eval.ending import SAFE
 from perch_eval.evaluation.document import machine, table
-from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, PHASES, PROCESS, REAL_TIME, REPORT_LIMIT, SAFE, TRAFFIC, Case, cases, judged_end
+from perch_eval.graph_faults.cases import FAULTS, LOCKSTEP, MODES, PHASES, PROCESS, REAL_TIME, REPORT_LIMIT, TRAFFIC, Case, cases, judged_end
 from perch_eval.graph_faults.flight import fly
 from perch_eval.revision import banner, code_version
 from perch_eval.rows import Rows, rows_of

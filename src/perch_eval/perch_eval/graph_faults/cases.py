@@ -35,8 +35,6 @@ DISTURBED_CHANNELS = {
 PHASES = ("climb", "search", "approach", "contact", "perched")
 LOCKSTEP, REAL_TIME = "lockstep", "real time"
 MODES = (LOCKSTEP, REAL_TIME)
-SAFE = ("hovering", "landed", "perched", "motors off")
-"""Safe ends; `motors off`: on the ground, tilted by 20 deg or more, motors off. Not after a crash."""
 REPORT_LIMIT = 5.0  # wall-clock time from the fault within which it must be reported [s]
 
 NODE_PATTERNS = {
@@ -89,37 +87,6 @@ def cases() -> list[Case]:
     found = [Case(*one) for one in product(PROCESS, NODES, PHASES, MODES)]
     found += [Case(fault, node, phase, REAL_TIME) for fault, node, phase in product(TRAFFIC, DISTURBED_CHANNELS, ("search", "approach"))]
     return sorted(found, key=lambda case: case._digest)
-
-
-class Situation(NamedTuple):
-    """True situation of the vehicle at one time.
-
-    Attributes:
-        height: height of the centre of mass above its place before the flight [m].
-        speed: [m/s].
-        tilt: [deg].
-        rotors: speed of the fastest rotor [rad/s].
-        held: whether velcro or gripper holds the vehicle.
-        hovers: whether the controller reports a hover.
-    """
-
-    height: float
-    speed: float
-    tilt: float
-    rotors: float
-    held: bool
-    hovers: bool
-
-
-def ending(now: Situation) -> str:
-    """Return the end of a flight by the true situation; a hover also requires the controller's state."""
-    if now.held and now.speed < 0.1 and now.rotors < 50.0:
-        return "perched"
-    if now.rotors < 50.0 and now.height < 0.15 and now.speed < 0.1:
-        return "landed" if now.tilt < 20.0 else "motors off"
-    if now.hovers and now.speed < 0.5 and now.tilt < 20.0 and now.height > 0.2:
-        return "hovering"
-    return "held with running motors" if now.held else "on the ground with running motors" if now.height < 0.15 else "in flight"
 
 
 def judged_end(end: str, impact: float) -> str:

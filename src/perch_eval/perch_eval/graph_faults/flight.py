@@ -12,8 +12,9 @@ from typing import Any
 
 from perch_core.errors import PerchError
 from perch_eval.domain import domain_in_environment
+from perch_eval.ending import SAFE, Situation, ending
 from perch_eval.fork_server import alive
-from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, REPORT_LIMIT, SAFE, Case, Situation, ending, first_report, judged_end
+from perch_eval.graph_faults.cases import LOCKSTEP, PROCESS, REPORT_LIMIT, Case, first_report, judged_end
 from perch_eval.graph_faults.group import Group
 from perch_eval.graph_faults.ros.watcher import Watcher
 from perch_eval.modelled_sight_node import imageless_launches

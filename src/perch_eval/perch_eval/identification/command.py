@@ -14,7 +14,7 @@ from perch_eval.arguments import command, command_parser
 from perch_eval.flight import Flight
 from perch_eval.identification import flight
 from perch_eval.identification.fit import Estimate, battery, identify
-from perch_eval.identification.record import record_of
+from perch_eval.identification.flight import record_of
 from perch_eval.identification.responses import Response, response_figure
 from perch_sim.scenario import load_scenario
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from perch_core.vehicle import GRAVITY, Vehicle
-from perch_eval.identification.record import Record
+from perch_eval.identification.flight import Record
 from perch_eval.identification.responses import Response, first_order_lag
 
 PARTS = 6            # of the record, fitted one by one for the scatter

@@ -136,11 +136,6 @@ class ModelledLocalizer:
 
 
 @dataclass(frozen=True)
-class NoParameters:
-    """Parameters of a component without parameters."""
-
-
-@dataclass(frozen=True)
 class MapParameters(PowerlineMapperConfig):
     """Parameters of the mapper, and scenario and seed of the truth."""
 

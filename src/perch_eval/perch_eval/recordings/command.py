@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Container, Sequence
 from functools import partial
 from itertools import chain, count
@@ -22,15 +23,13 @@ from perch_eval.arguments import command, command_parser, output_folder
 from perch_eval.node_launch import parse_overrides
 from perch_eval.recordings.calibration import to_yaml
 from perch_eval.recordings.check import check
-from perch_eval.recordings.evaluation import Evaluation, evaluate
-from perch_eval.recordings.drawing import Gallery
+from perch_eval.recordings.image_detections import Gallery, detect, draw_detections, guessed_mount
 from perch_eval.recordings.imu_check import check_estimated_biases
 from perch_eval.recordings.opening import open_recording
 from perch_eval.recordings.perception import Perception, node_config
-from perch_eval.recordings.image_detections import detect, draw_detections, guessed_mount
 from perch_eval.recordings.recording import Recording, RecordingError
 from perch_eval.recordings.report import ReportContent, bias_figure, error_figure, frames_figure, path_figure
-from perch_eval.recordings.trajectory import Trajectory, read_truth, write_tum
+from perch_eval.recordings.trajectory import Trajectory, evaluate, read_truth, write_tum
 from perch_perception.images import ImageError
 from perch_perception.powerline_mapper import PowerlineMapperConfig
 from perch_perception.target_localizer import TargetLocalizerConfig
@@ -118,15 +117,10 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
     checked, vio = check(recording), _trajectory(perception.states)
     if sensors.imu is not None:
         check_estimated_biases(checked, perception.states, sensors.imu)
-    content = ReportContent({"recording": str(recording.path), "camera": down, "front": front, "images": recording.images,
-                             "imu_samples": recording.samples, "damage": recording.damage},
-                            [("recording", str(recording.path.resolve())),
-                             ("sensors", f"{sensors.name}: VIO uses camera {down}, the others use camera {front}")])
+    content = ReportContent({"recording": str(recording.path.resolve()), "calibration": sensors.name, "camera": down, "front": front,
+                             "images": recording.images, "imu_samples": recording.samples, "damage": recording.damage})
     _add_motion(content, perception, vio, truth)
     _add_surroundings(content, perception)
-    content.figures |= {"findings": [vars(f) for f in checked.findings], "sensors": checked.figures}
-    if recording.damage:
-        content.rows.append(("damage", recording.damage))
     if perception.wires is not None:
         lines = perception.lines.lines if perception.lines is not None else ()
         write_json(args.out / "powerlines.json", [
@@ -136,40 +130,34 @@ def _run(args: argparse.Namespace, recording: Recording, sensors: Sensors, truth
     for name, motion in (("vio", vio), ("estimator", _trajectory(perception.odometry)), ("target", targets), ("truth", truth)):
         if motion is not None:
             write_tum(args.out / f"{name}.tum", motion)
-    content.write(args.out, recording, checked.findings, perception.log)
+    content.write(args.out, recording, checked, perception.log)
     return 0 if perception.states else 1
 
 
 def _add_motion(content: ReportContent, perception: Perception, vio: Trajectory, truth: Trajectory | None) -> None:
     """Add the results of VIO and estimator to the report."""
     frames, states = perception.vio.frames, perception.states
-    outcomes = {name: sum(f.outcome == name for f in frames) for name in dict.fromkeys(f.outcome for f in frames)}
-    cost = 1e3 * np.array([f.cost for f in frames]) if frames else np.zeros(1)
+    outcomes = Counter(result.outcome.name for _, _, result in frames)
+    cost = 1e3 * np.array([cost for _, cost, _ in frames]) if frames else np.zeros(1)
     median, p99 = float(np.median(cost)), float(np.percentile(cost, 99))
-    restarts = frames[-1].restarts if frames else 0
+    restarts = frames[-1][2].restarts if frames else 0
     content.figures |= {"frames": outcomes, "restarts": restarts, "vio_frame_ms": {"median": median, "p99": p99}}
-    content.rows += [("VIO frames", ", ".join(f"{n} {name.lower()}" for name, n in outcomes.items()) or "none"), ("restarts", str(restarts)),
-                  ("VIO, CPU time of a frame", f"{median:.1f} ms in the median, {p99:.1f} ms p99")]
     compared = None
     if len(vio) > 1:
         moved = np.linalg.norm(vio.p - vio.p[0], axis=1)
         content.figures["vio"] = {"path_m": vio.length, "largest_distance_m": float(moved.max()), "final_distance_m": float(moved[-1])}
-        content.rows.append(("VIO's path", f"{vio.length:.2f} m; ends {moved[-1]:.3f} m from its beginning, is at most {moved.max():.3f} m from it"))
         if truth is not None:
             try:
                 compared = evaluate(vio, truth, np.array([s.covariance[:3, :3] for s in states]))
                 content.figures["vio"] |= compared.figures
-                content.rows += _evaluation_rows("VIO", compared)
-                against = evaluate(_trajectory(perception.odometry[::max(1, len(perception.odometry) // 5000)]), truth)
-                content.figures["estimator"] = against.figures
-                content.rows += _evaluation_rows("estimator", against)[:2]
+                content.figures["estimator"] = evaluate(_trajectory(perception.odometry[::max(1, len(perception.odometry) // 5000)]), truth).figures
             except RecordingError as error:
-                content.rows.append(("not compared", str(error)))
+                content.figures["not_compared"] = str(error)
         content.plots["The path"] = path_figure(vio, compared)
         if compared is not None:
             index = {s.stamp: np.sqrt(np.diag(s.covariance)[:3]) for s in states}
             content.plots["Error and covariance"] = error_figure(compared, np.array([index[stamp] for stamp in compared.stamps.tolist()]))
-        content.plots["Biases"] = bias_figure(perception)
+        content.plots["Biases"] = bias_figure(states)
     if frames:
         content.plots["Tracks over time"] = frames_figure(frames)
     content.pictures["Tracks"] = perception.vio.gallery.images
@@ -178,45 +166,22 @@ def _add_motion(content: ReportContent, perception: Perception, vio: Trajectory,
 def _add_surroundings(content: ReportContent, perception: Perception) -> None:
     """Add the results on board and wires to the report."""
     if perception.sightings:
-        content.figures["target"], text = _board(perception)
-        content.rows.append(("board", text))
+        content.figures["target"] = _board(perception)
     if perception.lines is not None:
-        content.figures["powerlines"] = len(perception.lines.lines)
-        text = f"{len(perception.lines.lines)} segments" + (f"; {perception.lines.message}" if perception.lines.message else "")
-        content.rows.append(("powerlines", text))
+        content.figures |= {"powerlines": len(perception.lines.lines), "powerlines_message": perception.lines.message}
     if perception.target is not None:
         content.pictures |= {"The board": perception.target.found.images, "Without a board": perception.target.missed.images[:3]}
     if perception.wires is not None:
         content.pictures["Wires"] = perception.wires.gallery.images
 
 
-def _board(perception: Perception) -> tuple[dict[str, float], str]:
-    """Return the results on the board, which is static, as figures for JSON and in words."""
+def _board(perception: Perception) -> dict[str, float]:
+    """Return the results on the board, which is static."""
     found = [s for s in perception.sightings if s.pose_camera is not None]
-    figures = {"images": len(perception.sightings), "found": len(found), "poses": len(perception.targets), "reprojection_rms_px": np.nan}
-    text = f"found in {len(found)} of {len(perception.sightings)} images"
-    if found:
-        figures["reprojection_rms_px"] = rms = float(np.median([s.reprojection_rms for s in found]))
-        text += f", residual {rms:.2f} px"
     p = np.array([target.p_WS for target in perception.targets]).reshape(-1, 3)
-    if len(p) > 1:
-        figures["spread_m"] = spread = float(np.sqrt(((p - np.median(p, axis=0))**2).sum(axis=1).mean()))
-        text += f"; its position in the map scatters by {100 * spread:.1f} cm rms"
-    return figures, text
-
-
-def _evaluation_rows(name: str, e: Evaluation) -> list[tuple[str, str]]:
-    f = e.figures
-    drift = f"{f['drift_percent']:.2f} % of the path" if np.isfinite(f["drift_percent"]) else "a path too short for a share"
-    start = (f"{name}: from the start on", f"{100 * f['final_error_m']:.1f} cm off at the end ({drift}), "
-             f"{100 * f['largest_error_m']:.1f} cm at most; attitude {f['attitude_rms_deg']:.2f} deg rms")
-    nees = (f"{name}: NEES of the position", f"{f['nees_position_mean']:.2f} in the mean (consistent: 3)")
-    if not np.isfinite(f["ate_rmse_m"]):  # it stands, or moves along a line
-        return [start, nees]
-    attitude, why = (f", {f['ate_rmse_deg']:.2f} deg", "") if np.isfinite(f["ate_rmse_deg"]) else ("", "; too straight a path to align attitudes by")
-    return [(f"{name}: ATE (evo)", f"{100 * f['ate_rmse_m']:.2f} cm{attitude} rms over {f['compared_s']:.1f} s and {f['path_m']:.1f} m{why}"), start,
-            (f"{name}: RPE (evo)", f"{100 * f['rpe_rmse_m']:.2f} cm, {f['rpe_rmse_deg']:.2f} deg rms over {f['rpe_delta_m']:g} m"),
-            (f"{name}: scale", f"{f['scale']:.4f}"), nees]
+    return {"images": len(perception.sightings), "found": len(found), "poses": len(p),
+            "reprojection_rms_px": float(np.median([s.reprojection_rms for s in found])) if found else np.nan,
+            "spread_m": float(np.sqrt(((p - np.median(p, axis=0))**2).sum(axis=1).mean())) if len(p) > 1 else np.nan}
 
 
 def _trajectory(states: Sequence[InertialState] | Sequence[OdometryState]) -> Trajectory:
@@ -253,17 +218,15 @@ def _detect_in_images(args: argparse.Namespace, recording: Recording, overrides:
             problems.append(f"{name}: {error}")
             continue
         detections[name] = found.figures()
-        gallery.offer(partial(draw_detections, image, found, board, name))
+        gallery.offer(image.stamp, partial(draw_detections, image, found, board, name))
     problems += [recording.damage] if recording.damage else []
-    tags, poses = sum(len(d["tags"]) for d in detections.values()), sum("board" in d for d in detections.values())
-    rows = [("recording", str(recording.path.resolve())),
-            ("images", f"{len(detections)}" + ("; the camera is not calibrated" if recording.sensors is None else
-                                               "; the sensor file describes no IMU" if recording.sensors.imu is None else "")), ("tags", str(tags)),
-            ("board", f"posed in {poses}"), ("wires", str(sum(len(d["wires"]) for d in detections.values())))]
-    rows += [("problem", problem) for problem in problems]
+    sensors = recording.sensors
+    missing = "calibration of the camera" if sensors is None else "IMU in the sensor file" if sensors.imu is None else ""
+    figures = {"recording": str(recording.path.resolve()), "images": len(detections), "missing": missing,
+               "tags": sum(len(d["tags"]) for d in detections.values()), "boards": sum("board" in d for d in detections.values()),
+               "wires": sum(len(d["wires"]) for d in detections.values()), "problems": problems}
     write_json(args.out / "detections.json", detections)
-    figures = {"images": len(detections), "tags": tags, "boards": poses, "problems": problems}
-    ReportContent(figures, rows, pictures={"What was found": gallery.images}).write(args.out, recording)
+    ReportContent(figures, pictures={"What was found": gallery.images}).write(args.out, recording)
     return 0 if detections else 1
 
 

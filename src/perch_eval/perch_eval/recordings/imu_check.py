@@ -1,21 +1,77 @@
-"""Checks of IMU samples: units, range, rest, biases and noise."""
+"""Checks of IMU samples (units, range, rest, biases, noise), and the findings of a check: what would make perception fail."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from perch_core.sensors import ImuSensor
 from perch_core.values import InertialState
 from perch_core.vehicle import GRAVITY
-from perch_eval.recordings.findings import Report, check_rate
 
+OK, WARNING, FAILS = "ok", "warning", "fails"
+RATE_MAX = 10_000.0  # rate of a sensor [Hz]
+RATE_TOLERANCE = 0.01  # share by which a rate may lie below a bound: clocks differ
 STILL_WINDOW = 0.2  # [s]
 STILL_MEAN = (0.02, 0.2)  # by how much a window's mean may differ from those before it, at rest [rad/s, m/s^2]
 GYRO_BIAS_MAX = 0.2  # mean at rest above which a warning is given, whatever the sensor file allows [rad/s]
 BIAS_SIGMAS = 3.0  # by how many sigma of the turn-on bias a mean at rest, or an estimate, may be off
 STILL_SIGMA = (0.3, 2.0)  # 1 sigma within a window: rotors that idle shake the vehicle, but do not move it [rad/s, m/s^2]
+
+
+class Finding(NamedTuple):
+    """One line of the check: `ok`, `warning` or `fails`, what it is about, and what was found."""
+
+    level: str
+    about: str
+    text: str
+
+
+@dataclass
+class Report:
+    """All findings, and the figures behind them."""
+
+    findings: list[Finding] = field(default_factory=list)
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    def add(self, about: str, text: str, warning: bool = False, fails: bool = False) -> None:
+        """Add a finding."""
+        self.findings.append(Finding(FAILS if fails else WARNING if warning else OK, about, text))
+
+    @property
+    def fails(self) -> bool:
+        """Whether something would make perception fail."""
+        return any(finding.level == FAILS for finding in self.findings)
+
+
+def check_rate(report: Report, about: str, stamps: np.ndarray, minimum: float, recommended: float, nominal: float | None) -> float:
+    """Check rate, jitter (1 sigma of an interval, in periods) and gaps of ascending stamps (three or more); return rate [Hz]."""
+    intervals = 1e-9 * np.diff(stamps)
+    reach = min(9, len(intervals))  # stamps may come in batches
+    period = float(np.median(stamps[reach:] - stamps[:-reach])) * 1e-9 / reach
+    rate, beside = 1.0 / period, np.pad(intervals, 1, constant_values=period)
+    gap = (intervals > 1.8 * period) & (beside[:-2] + intervals + beside[2:] > 3.5 * period)
+    jitter, gaps = float(intervals[~gap].std() / period) if not gap.all() else np.nan, intervals[gap]
+    report.figures[f"{about} rate_hz"] = rate
+    slow = rate < (1.0 - RATE_TOLERANCE) * recommended
+    wrong = nominal is not None and not 0.8 < rate / nominal < 1.25
+    report.add(f"{about} rate",
+               f"{rate:.1f} Hz over {1e-9 * (stamps[-1] - stamps[0]):.1f} s" + (f", {nominal:g} Hz in the sensor file" if wrong else "") +
+               (f": at least {recommended:g} Hz are recommended" if slow else "") +
+               (": stamps are not in nanoseconds" if rate > RATE_MAX else ""),
+               warning=slow or wrong, fails=not (1.0 - RATE_TOLERANCE) * minimum <= rate <= RATE_MAX)
+    report.add(f"{about} jitter",
+               f"{1e3 * jitter * period:.2f} ms (1 sigma), {100 * jitter:.0f} % of the period" +
+               (": stamps are taken on arrival, or in batches; stamp where the sensor is sampled" if jitter > 0.1 else ""),
+               warning=jitter > 0.1)
+    if len(gaps):
+        lost = round(float((gaps / period - 1.0).sum()))
+        share = 100 * lost / (len(stamps) + lost)
+        report.add(f"{about} gaps", f"{len(gaps)}, the longest {1e3 * gaps.max():.0f} ms; {lost} missing ({share:.1f} %)", warning=True)
+    return rate
 
 
 def check_imu(report: Report, stamps: np.ndarray, imu: np.ndarray, sensor: ImuSensor | None) -> None:
@@ -109,8 +165,7 @@ def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor
     white = np.median(deviation[short] * np.sqrt(tau[short])[:, None], axis=0)
     gyro, accel = deviation[:, :3].max(axis=1), deviation[:, 3:].max(axis=1)
     densities = {"gyro": float(white[:3].max()), "accel": float(white[3:].max())}
-    report.figures |= {"gyro_noise_density": densities["gyro"], "accel_noise_density": densities["accel"], "allan_tau_s": tau.tolist(),
-                       "allan_gyro": gyro.tolist(), "allan_accel": accel.tolist()}
+    report.figures |= {"gyro_noise_density": densities["gyro"], "accel_noise_density": densities["accel"]}
     if tau[-1] >= 5.0:
         report.add("bias stability", f"gyro {gyro.min():.1e} rad/s, accelerometer {accel.min():.1e} m/s^2 (least Allan deviation)")
     for name, unit in (("gyro", "rad/s/sqrt(Hz)"), ("accel", "m/s^2/sqrt(Hz)")):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -16,7 +15,7 @@ from perch_core.tag_board import load_board
 from perch_core.values import (CameraImage, CameraModel, ImuSample, InertialState, OdometryState, PowerlineMap,
                                TargetPose, TargetSighting)
 from perch_eval.node_launch import read_parameters
-from perch_eval.recordings.drawing import Gallery, GalleryImage, canvas, caption, draw_board, draw_wires
+from perch_eval.recordings.image_detections import Gallery, GalleryImage, canvas, caption, draw_board, draw_wires
 from perch_eval.recordings.recording import Event
 from perch_perception.camera_component import CameraComponent
 from perch_perception.estimator_component import StateEstimator
@@ -24,6 +23,7 @@ from perch_perception.line_mapping import detect_lines
 from perch_perception.images import mono_image, rgb_image
 from perch_perception.powerline_mapper import PowerlineMapper
 from perch_perception.target_localizer import TargetLocalizer
+from perch_perception.vio import VioResult
 from perch_perception.vio_component import VioComponent
 
 if TYPE_CHECKING:
@@ -35,31 +35,10 @@ MAX_POSITION_SIGMA = 100.0  # 1 sigma of a position that is kept [m]
 TAIL = 8  # frames of history in a picture of tracks
 
 
-@dataclass(frozen=True)
-class Frame:
-    """Result of VIO for one frame.
-
-    Attributes:
-        stamp: of the image [ns].
-        outcome: name of the `FrameOutcome`.
-        features, used, refused: tracks, and observations that changed the state or were refused.
-        restarts: number of restarts so far.
-        cost: CPU time [s].
-    """
-
-    stamp: int
-    outcome: str
-    features: int
-    used: int
-    refused: int
-    restarts: int
-    cost: float
-
-
 class _Vio(VioComponent):
-    """VIO component that records every frame and draws some."""
+    """VIO component that draws some of its frames, and keeps of each the stamp [ns], the CPU time [s] and the result."""
 
-    frames: list[Frame]
+    frames: list[tuple[int, float, VioResult]]
     gallery: Gallery
 
     def use(self, image: CameraImage) -> None:
@@ -70,14 +49,14 @@ class _Vio(VioComponent):
         super().use(image)
         r = self.result
         assert r is not None  # of this frame
-        self.frames.append(Frame(image.stamp, r.outcome.name, r.features, r.used, r.refused, r.restarts, time.process_time() - begin))
+        self.frames.append((image.stamp, time.process_time() - begin, r))
         text = f"{r.outcome.name.lower()}: {r.features} tracks, {r.used} used"
 
         def shown() -> GalleryImage | None:
             pixels = drawn[-1].pixels() if drawn else None
-            return None if pixels is None else GalleryImage(image.stamp, text, pixels)
+            return None if pixels is None else (text, pixels)
 
-        self.gallery.offer(shown)
+        self.gallery.offer(image.stamp, shown)
 
 
 class _Target(TargetLocalizer):
@@ -91,7 +70,7 @@ class _Target(TargetLocalizer):
         """Process an image as the base class does and offer a picture."""
         super().process_image(image, exposure_time)
         sighting = self.sightings[-1]
-        (self.missed if sighting.pose_camera is None else self.found).offer(lambda: self._drawn(image, sighting))
+        (self.missed if sighting.pose_camera is None else self.found).offer(image.stamp, lambda: self._drawn(image, sighting))
 
     def _drawn(self, image: CameraImage, sighting: TargetSighting) -> GalleryImage | None:
         if image.pixels() is None:
@@ -102,7 +81,7 @@ class _Target(TargetLocalizer):
         if sighting.pose_camera is not None:
             draw_board(drawn, camera, load_board(self.config.board), sighting.pose_camera, sighting.ids)
             text = f"tags {list(sighting.ids)}, {np.linalg.norm(sighting.pose_camera.p_WS):.2f} m, rms {sighting.reprojection_rms:.2f} px"
-        return GalleryImage(image.stamp, text, caption(drawn, text[:80]))
+        return caption(drawn, text)
 
 
 class _Wires(PowerlineMapper):
@@ -113,7 +92,7 @@ class _Wires(PowerlineMapper):
     def process_image(self, image: CameraImage, exposure_time: float) -> None:
         """Process an image as the base class does and offer a picture."""
         super().process_image(image, exposure_time)
-        self.gallery.offer(lambda: self._drawn(image))
+        self.gallery.offer(image.stamp, lambda: self._drawn(image))
 
     def _drawn(self, image: CameraImage) -> GalleryImage | None:
         if image.pixels() is None:
@@ -123,7 +102,7 @@ class _Wires(PowerlineMapper):
         wires = detect_lines(pixels, camera, self.config.detection)
         drawn = canvas(mono_image(image, camera))
         draw_wires(drawn, camera, wires)
-        return GalleryImage(image.stamp, f"{len(wires)} wires", caption(drawn, f"{len(wires)} wires"))
+        return caption(drawn, f"{len(wires)} wires")
 
 
 def node_config(node: str, config_type: type[T], given: Mapping[str, Any], overrides: Mapping[str, Mapping[str, Any]]) -> T:

@@ -12,10 +12,10 @@ from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.sensors import Sensors, load_sensors
 from perch_eval.arguments import command, command_parser, output_file
-from perch_eval.recordings.asl import root_of
 from perch_eval.recordings.calibration import from_asl, from_kalibr, to_yaml
 from perch_eval.recordings.check import check
 from perch_eval.recordings.opening import open_recording
+from perch_eval.recordings.recording import root_of
 
 EXAMPLES = """examples:
   python3 scripts/sensors.py import kalibr camchain-imucam.yaml imu.yaml --out mine.yaml

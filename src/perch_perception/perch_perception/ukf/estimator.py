@@ -112,6 +112,14 @@ class Estimator:
             P=self._live.P)
 
     @property
+    def motion(self) -> tuple[float, ...] | None:
+        """p_WB, v_WB, q_WB and w_WB_B of `estimate`, 13 floats, in a tenth of its time."""
+        if self._live is None:
+            return None
+        x, (a, b, c) = self._x.tolist(), self._imu.newest.w_B
+        return (*x[:10], a - x[10], b - x[11], c - x[12])
+
+    @property
     def gyro_sigma(self) -> float:
         """1 sigma of the newest gyro sample [rad/s]."""
         return self._imu.gyro_sigma

@@ -23,7 +23,9 @@ _BATCH, _PACKET = struct.Struct("<qI"), struct.Struct("<HI")  # stamp [ns] and n
 _PEER = struct.Struct("3i")                                   # process, user, group
 _SEND_LIMIT = struct.pack("ll", 0, 20_000)                    # longest wait for a participant that does not read [s, us]
 _RECEIVE_LIMIT = struct.pack("ll", 10, 0)                     # ... and for the rest of a message that has begun [s, us]
+_SEND_BUFFER = 1 << 20                                       # holds an image, so that the vehicle does not wait for its reader [B]
 _LENGTH = struct.Struct("!i")                                 # of a message, as in multiprocessing
+_READ = 1 << 13                                               # holds the batch of a fast participant [B]
 
 
 def address(domain: str, namespace: str) -> str:
@@ -114,6 +116,7 @@ class ParticipantListener:
             user = _PEER.unpack(peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
             peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _SEND_LIMIT)
             peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _RECEIVE_LIMIT)
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # as far as net.core.wmem_max permits
             connection = Connection(peer.detach())
             try:
                 if user != os.getuid() or not connection.poll(1.0):
@@ -135,6 +138,11 @@ class NonBlockingSender:
         self._socket = socket.socket(fileno=os.dup(connection.fileno()))
         self._unsent = memoryview(b"")
 
+    @property
+    def finished(self) -> bool:
+        """Whether the last message has been sent completely."""
+        return not self._unsent
+
     def send(self, data: bytes) -> None:
         """Send a message, with at most `_SEND_LIMIT` of waiting for the reader; the previous one must have been read.
 
@@ -150,9 +158,11 @@ class NonBlockingSender:
         Raises:
             OSError: the other end has closed the connection.
         """
-        with suppress(BlockingIOError):
+        try:
             while self._unsent:
                 self._unsent = self._unsent[self._socket.send(self._unsent, flags):]
+        except BlockingIOError:
+            pass
 
     def close(self) -> None:
         """Close the sending socket."""
@@ -166,6 +176,35 @@ def connect_to_vehicle(where: str, name: str, inputs: frozenset[str]) -> Connect
         connection.send_bytes(json.dumps({"node": name, "inputs": sorted(inputs)}).encode())
         return connection
     return None
+
+
+def receive(connection: Connection) -> bytes:
+    """Return the next message of a connection whose other end waits for the answer, so that no other message follows it.
+
+    `Connection.recv_bytes` reads length and content by one call of the operating system each, this function by one for both.
+
+    Raises:
+        EOFError: the connection has ended.
+        OSError: it is broken, or the rest of a message does not come.
+        PerchError: what it sends is not one message.
+    """
+    data = _read(connection, _READ)
+    while len(data) < _LENGTH.size:
+        data += _read(connection, _READ)
+    parts, left = [data[_LENGTH.size:]], _LENGTH.size + _LENGTH.unpack_from(data)[0] - len(data)
+    while left > 0:
+        parts.append(_read(connection, left))
+        left -= len(parts[-1])
+    if left < 0:
+        raise PerchError("lockstep: more than one message at a time")
+    return b"".join(parts)
+
+
+def _read(connection: Connection, size: int) -> bytes:
+    data = os.read(connection.fileno(), size)
+    if not data:
+        raise EOFError
+    return data
 
 
 class ConnectionPoll:

@@ -69,6 +69,7 @@ class Schedule:
     Attributes:
         now: stamp of the present step [ns].
         index: number of steps completed.
+        names: names of the participants, in the order in which they work within a step.
     """
 
     def __init__(self, vehicle: Component[Any], participants: Iterable[Participant], tasks: Mapping[str, Task],
@@ -94,16 +95,12 @@ class Schedule:
         self._pending_images: dict[str, deque[CameraImage]] = {}
         self._awaited: Slot | None = None  # fast participant whose answer is missing
         self._routes = _Routes(self._receivers)
+        self.names: list[str] = []
         for participant in participants:
             self.join(participant)
         self._steps = self._flight()
 
     # -- participants ------------------------------------------------------------------------------------------------
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the participants, in the order in which they work within a step."""
-        return [name for name, slot in self._slots.items() if slot.participant is not None]
 
     def join(self, participant: Participant) -> None:
         """Add a participant, or replace the one of the same name, whose pending results are discarded.
@@ -133,6 +130,7 @@ class Schedule:
 
     def _reroute(self) -> None:
         self._routes.clear()
+        self.names = [name for name, slot in self._slots.items() if slot.participant is not None]
         taken = {channel for slot in self._slots.values() for channel in slot.inputs}
         taken |= set(self._vehicle_receivers)
 

@@ -24,7 +24,7 @@ from perch_core.ros.priority import priority
 from perch_core.ros.wiring import Wiring
 from perch_core.values import Serialized
 from perch_sim.lockstep import Answer, LocalParticipant, Packet, is_slow
-from perch_sim.lockstep.link import ConnectionPoll, address, connect_to_vehicle, pack, unpack
+from perch_sim.lockstep.link import ConnectionPoll, address, connect_to_vehicle, pack, receive, unpack
 from rclpy.clock import Clock, ClockType
 
 CONNECT_PERIOD = 0.1   # between attempts to connect to the vehicle [s]
@@ -70,6 +70,7 @@ class ParticipantNode(ComponentNode):
         self._request_senders: dict[str, Send] = {}
         self._open_requests: list[_OpenRequest] = []
         self._busy = False  # processing a batch
+        self._unfinished = False  # the batch waits for an answer or a goal, and is checked again by the timer
         self._vehicle: Any = None  # the connection to it, if any
         self._served = False  # a batch has come over this connection
         self._without_vehicle_since = time.monotonic()
@@ -119,7 +120,7 @@ class ParticipantNode(ComponentNode):
             if not self._connection_poll.ready(POLL_TIMEOUT):
                 break
             try:
-                stamp, batch = unpack(self._vehicle.recv_bytes(), topics)
+                stamp, batch = unpack(receive(self._vehicle), topics)
             except (OSError, EOFError, PerchError):
                 self._disconnect()
                 return
@@ -139,12 +140,14 @@ class ParticipantNode(ComponentNode):
             # The vehicle sends nothing before it has the results: it has ended. Answers come or are given up, but goals may never come.
             if self._connection_poll.ready(0.0) and all(request.answer.done() for request in self._open_requests):
                 self._disconnect()
-            elif self._check_timer.is_canceled():
+            elif not self._unfinished:
+                self._unfinished = True
                 self._check_timer.reset()
             return
         self._busy = False
-        waited = not self._check_timer.is_canceled()
-        self._check_timer.cancel()
+        waited, self._unfinished = self._unfinished, False
+        if waited:
+            self._check_timer.cancel()
         try:
             self._vehicle.send_bytes(pack(0, packets, self.log_refusal))
         except OSError:
@@ -163,7 +166,7 @@ class ParticipantNode(ComponentNode):
 
     def _disconnect(self) -> None:
         """Close the connection to a vehicle that has ended; another one may be found later."""
-        self._busy = False
+        self._busy = self._unfinished = False
         self._check_timer.cancel()
         self._connection_poll.remove(self._vehicle)
         self._vehicle, self._without_vehicle_since = None, time.monotonic()

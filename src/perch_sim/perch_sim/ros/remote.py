@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_sim.lockstep import Packet, Participant
-from perch_sim.lockstep.link import NonBlockingSender, pack, unpack
+from perch_sim.lockstep.link import NonBlockingSender, pack, receive, unpack
 
 DISCONNECTED = "has disconnected"
 
@@ -43,6 +43,8 @@ class RemoteParticipant(Participant):
 
     def flush(self) -> None:
         """Send the rest of a batch to a process that did not read all of it."""
+        if self._sender.finished:
+            return
         try:
             self._sender.flush()
         except OSError:
@@ -55,7 +57,7 @@ class RemoteParticipant(Participant):
     def receive(self) -> None:
         """Receive the results of a batch; set `ended` if the connection has ended, or if what it sends is no batch."""
         try:
-            _, packets = unpack(self.connection.recv_bytes(), topics)
+            _, packets = unpack(receive(self.connection), topics)
         except BlockingIOError:
             self.ended = "is disconnected: it has stopped within a message"
         except (OSError, EOFError):

@@ -166,12 +166,13 @@ class VehicleNode(ComponentNode):
 
     def _burst(self) -> None:
         """Advance up to `BURST` steps, then let the executor process other events first."""
-        schedule = self._schedule
+        schedule, received = self._schedule, False
         for _ in range(BURST):
             if not self._step_due():
                 return
-            if self._remote:
+            if self._remote and not received:
                 self._receive(0.0)
+            received = False
             try:
                 completed = schedule.advance()
             except Exception as error:
@@ -184,7 +185,8 @@ class VehicleNode(ComponentNode):
             elif not schedule.await_image(IMAGE_TIMEOUT):
                 if not any(pending.name in self._remote for pending in schedule.pending()):
                     return  # a participant of this process waits for an answer or a goal; `wiring.progress` continues
-                if not self._receive(POLL_TIMEOUT):
+                received = self._receive(POLL_TIMEOUT)
+                if not received:
                     break
         if not self._advance_queued:
             self._advance_queued = True

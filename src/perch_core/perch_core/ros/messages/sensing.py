@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import array
 from io import BytesIO
+from typing import Any
 
 import cv2
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from perch_core.camera import camera_of, camera_parameters
 from perch_core.errors import PerchError
+from perch_core.ros.cdr import Layout
 from perch_core.ros.messages.basic import flat, floats, header, quaternion_floats, require_measured, stamp_value, to_quaternion, to_vector
-from perch_core.values import CameraImage, CameraModel, CompressedPixels, ImuSample, StampedTransform, Transform
+from perch_core.values import NANOSECONDS, CameraImage, CameraModel, CompressedPixels, ImuSample, StampedTransform, Transform
 from perch_core.values.limits import LIMITS
 from PIL import Image as pillow
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 
 pillow.MAX_IMAGE_PIXELS = None  # the limits are those of `CameraImage`
 _GENERIC = {"8UC1": "mono8", "8UC3": "bgr8"}  # what the bytes mean in ROS' generic encodings
+_IMAGE = Layout(Image)
 
 
 def imu_value(msg: Imu) -> ImuSample:
@@ -27,20 +30,29 @@ def imu_value(msg: Imu) -> ImuSample:
 
 
 def image_value(msg: Image) -> CameraImage:
-    """Convert `sensor_msgs/Image` to an image; the pixels are a view of the message's data.
+    """Convert `sensor_msgs/Image` to an image, as `unpack_image` does."""
+    return _image(stamp_value(msg.header.stamp), msg.header.frame_id, msg.height, msg.width, msg.encoding, msg.step, msg.data)
+
+
+def unpack_image(data: bytes) -> CameraImage:
+    """Return the image of a serialised `sensor_msgs/Image`; the pixels are a view of the data.
 
     Raises:
         PerchError: an encoding other than mono8, 8UC1, rgb8, bgr8, 8UC3, or truncated data.
     """
-    encoding = _GENERIC.get(msg.encoding, msg.encoding)
-    if encoding not in CameraImage.CHANNELS:
-        raise PerchError(f"image: encoding {msg.encoding!r} is not one of {', '.join((*CameraImage.CHANNELS, *_GENERIC))}")
-    channels, data = CameraImage.CHANNELS[encoding], np.frombuffer(msg.data, np.uint8)
-    if not msg.height or not msg.width or msg.step < msg.width * channels or data.size < msg.step * msg.height:
-        raise PerchError(f"image: {data.size} bytes in rows of {msg.step} do not fit {msg.width} x {msg.height} px of {msg.encoding}")
-    rows = data[: msg.step * msg.height].reshape(msg.height, msg.step)[:, : msg.width * channels]
-    pixels = rows if channels == 1 else rows.reshape(msg.height, msg.width, channels)
-    return CameraImage(stamp_value(msg.header.stamp), msg.header.frame_id, msg.width, msg.height, encoding, pixels)
+    sec, nanosec, frame, height, width, encoding, _, step, pixels = _IMAGE.unpack(data)
+    return _image(sec * NANOSECONDS + nanosec, frame, height, width, encoding, step, pixels)
+
+
+def _image(stamp: int, frame: str, height: int, width: int, encoding: str, step: int, data: Any) -> CameraImage:
+    meaning = _GENERIC.get(encoding, encoding)
+    if meaning not in CameraImage.CHANNELS:
+        raise PerchError(f"image: encoding {encoding!r} is not one of {', '.join((*CameraImage.CHANNELS, *_GENERIC))}")
+    channels, values = CameraImage.CHANNELS[meaning], np.frombuffer(data, np.uint8)
+    if not height or not width or step < width * channels or values.size < step * height:
+        raise PerchError(f"image: {values.size} bytes in rows of {step} do not fit {width} x {height} px of {encoding}")
+    rows = values[: step * height].reshape(height, step)[:, : width * channels]
+    return CameraImage(stamp, frame, width, height, meaning, rows if channels == 1 else rows.reshape(height, width, channels))
 
 
 def compressed_value(msg: CompressedImage) -> CameraImage:
@@ -84,13 +96,11 @@ def compressed_message(image: CompressedPixels) -> CompressedImage:
     return msg
 
 
-def image_message(image: CameraImage) -> Image:
-    """Convert an image to `sensor_msgs/Image`."""
-    channels = CameraImage.CHANNELS[image.encoding]
-    msg = Image(header=header(image.stamp, image.frame), height=image.height, width=image.width, encoding=image.encoding,
-                step=image.width * channels)
-    msg.data = array.array("B", np.ascontiguousarray(image.pixels()).tobytes())  # any other sequence takes 18 ms
-    return msg
+def pack_image(image: CameraImage) -> bytes:
+    """Return the serialised `sensor_msgs/Image` of an image."""
+    pixels = np.ascontiguousarray(image.pixels(), np.uint8)
+    return _IMAGE.pack(*divmod(image.stamp, NANOSECONDS), image.frame, image.height, image.width, image.encoding, 0,
+                       image.width * CameraImage.CHANNELS[image.encoding], pixels.ravel().data)
 
 
 def camera_info_value(msg: CameraInfo) -> CameraModel:

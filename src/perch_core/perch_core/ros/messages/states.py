@@ -6,10 +6,9 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped as PoseStampedMessage
 from perch_core.ros.messages.basic import (
     flat, floats, header, quaternion_floats, square, stamp_value, to_point, to_pose, to_quaternion, to_vector)
-from perch_core.values import Contact, EstimatorHealth, InertialState, PoseStamped, RotorState
+from perch_core.values import Contact, EstimatorHealth, InertialState, PoseStamped
 from perch_msgs.msg import Contact as ContactMessage
 from perch_msgs.msg import EstimatorStatus, VioState
-from perch_msgs.msg import RotorState as RotorStateMessage
 
 
 def inertial_value(msg: VioState) -> InertialState:
@@ -42,16 +41,6 @@ def health_message(health: EstimatorHealth) -> EstimatorStatus:
         updates_rejected=int(health.rejected), nis=float(health.nis), gyro_bias=to_vector(health.gyro_bias),
         accel_bias=to_vector(health.accel_bias), position_sigma=float(health.position_sigma), attitude_sigma=float(health.attitude_sigma),
         message=health.message)
-
-
-def rotors_value(msg: RotorStateMessage) -> RotorState:
-    """Convert from `perch_msgs/RotorState`."""
-    return RotorState(stamp_value(msg.header.stamp), tuple(msg.rotor_speed.tolist()), tuple(msg.thrust.tolist()))
-
-
-def rotors_message(state: RotorState) -> RotorStateMessage:
-    """Convert to `perch_msgs/RotorState`."""
-    return RotorStateMessage(header=header(state.stamp, "base_link"), rotor_speed=np.array(state.speed, float), thrust=np.array(state.thrust, float))
 
 
 def contact_value(msg: ContactMessage) -> Contact:

@@ -12,7 +12,7 @@ from std_msgs.msg import String
 from perch_control.modes import State
 from perch_core.ros import topics
 from perch_core.values import seconds
-from perch_eval.graph_faults.cases import Situation
+from perch_eval.ending import Situation
 from perch_eval.metrics import tilt_degrees
 from perch_eval.ros.mission_client import MissionClient
 from perch_sim.contact_event import ContactState

@@ -1,6 +1,6 @@
 """True perch motions without a simulator: rest on the ground, take-off, hover, perch on an inclined surface.
 
-For evaluating estimators alone, in thousands of runs: exact poses, rates and forces from a smooth path by
+For testing estimators alone: exact poses, rates and forces from a smooth path by
 differential flatness, and simulated readings of a vehicle's IMU.
 """
 

@@ -1,11 +1,12 @@
 """VIO and estimator components on the flight loop, with a prescribed motion and rendered images, without a controller.
 
-For benchmarks, tests and Monte-Carlo runs of consistency. Images, camera calibration errors and IMU are the simulator's, the
-motion is exact (`perch_motion`). Of the truth, the estimators are given only a perturbed start pose.
+For benchmarks and tests. Images, camera calibration errors and IMU are the simulator's, the motion is exact
+(`open_loop.motion`). Of the truth, the estimators are given only a perturbed start pose.
 """
 
 from __future__ import annotations
 
+import gc
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -13,17 +14,17 @@ from typing import Protocol
 
 import numpy as np
 
+from closed_loop.plant import NoParameters
 from perch_core import so3
 from perch_core.camera_mount import CameraMount
 from perch_core.component import Component, Input, Output
-from perch_core.processes import frozen_heap
+from perch_core.processes import freeze_heap
 from perch_core.urdf import optical_frame
 from perch_core.values import CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState
 from perch_core.vehicle import load_vehicle
 from perch_eval.consistency import attitude_error
 from perch_eval.in_process import Loop
-from perch_eval.in_process.modelled_sight import NoParameters
-from perch_eval.perch_motion import ImuReadings, Motion, PerchMotion, PerchMotionConfig, read_imu
+from open_loop.motion import ImuReadings, Motion, PerchMotion, PerchMotionConfig, read_imu
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.ukf import Estimate, UkfConfig
 from perch_perception.vio import VioResult
@@ -218,23 +219,19 @@ class _ReplayedVio(Component[NoParameters]):
 
 
 class _Estimator(StateEstimator):
-    """Estimator that records its state at every `STRIDE`-th sample from `begin` [s] on, and the NIS of accepted VIO states."""
+    """Estimator that records its state at every `STRIDE`-th sample from `begin` [s] on."""
 
     def __init__(self, begin: float) -> None:
         super().__init__(UkfConfig())  # type: ignore[arg-type]  # the name of the estimator is nothing to itself
         self._from, self._samples = round(begin * 1e9), 0
         self.states: list[tuple[int, Estimate]] = []  # number of the sample
-        self.nis: list[tuple[float, int]] = []  # and its dimension
 
     def on_imu(self, sample: ImuSample) -> None:
-        """Process a sample as the base class does; record NIS and state."""
-        accepted = self._estimator.status.accepted
+        """Process a sample as the base class does; record the state."""
         super().on_imu(sample)
-        if self._estimator.status.accepted > accepted:
-            self.nis.append((self._estimator.status.nis, self._estimator.status.nis_dimension))
         if sample.stamp >= self._from and self._samples % STRIDE == 0:
-            assert self._estimator.estimate is not None
-            self.states.append((self._samples, self._estimator.estimate))
+            assert self.filter.estimate is not None
+            self.states.append((self._samples, self.filter.estimate))
         self._samples += 1
 
 
@@ -256,9 +253,12 @@ def run_vio(flight: Flight, begin: float = 0.0, level_ground: bool = True) -> li
 
 
 def _run(loop: Loop, vehicle: _Vehicle) -> None:
-    with frozen_heap():  # as nodes do
+    freeze_heap()  # as nodes do
+    try:
         while not vehicle.over:
             loop.step()
+    finally:
+        gc.unfreeze()
 
 
 def _vio_error(flight: Flight, result: VioResult) -> np.ndarray | None:
@@ -278,14 +278,12 @@ class EstimatorTrack:
         times: [s], shape (n,).
         errors: truth minus estimate of (p, v, theta, b_g, b_a), shape (n, 15).
         covariances: shape (n, 15, 15).
-        nis: of each of the m VIO states that were used, and its dimension, shape (m, 2).
         health: the estimator's health messages, ten per second.
     """
 
     times: np.ndarray
     errors: np.ndarray
     covariances: np.ndarray
-    nis: np.ndarray
     health: tuple[EstimatorHealth, ...] = ()
 
 
@@ -301,5 +299,4 @@ def run_estimator(flight: Flight, steps: list[VioStep], latency: float = 0.040, 
     errors = [np.concatenate([truth.p_WB[k] - e.p_WB, truth.v_WB[k] - e.v_WB, attitude_error(q[k], e.q_WB),
                               readings.gyro_bias[k] - e.gyro_bias, readings.accel_bias[k] - e.accel_bias]) for k, e in estimator.states]
     return EstimatorTrack(np.array([truth.times[k] for k, _ in estimator.states]), np.array(errors),
-                          np.array([e.P for _, e in estimator.states]), np.array(estimator.nis, float).reshape(-1, 2),
-                          tuple(loop.trace.values("estimator/status")))
+                          np.array([e.P for _, e in estimator.states]), tuple(loop.trace.values("estimator/status")))
