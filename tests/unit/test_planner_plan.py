@@ -189,7 +189,7 @@ def test_minimum_time_is_shorter_and_still_verifies():
 
 
 def test_minimum_time_also_shortens_a_plan_with_a_fine_division():
-    problem = random_problem(np.random.default_rng(254))
+    problem = random_problem(np.random.default_rng(303))
     usual, shortest = checked(problem), checked(problem, PerchSettings(minimum_time=True))
     assert usual.trajectory.durations[-1] < 0.3 and shortest.duration < 0.95 * usual.duration
 
@@ -484,9 +484,9 @@ def test_no_plan_under_a_shorter_duration_max_is_shorter_than_minimum_time(incli
             plan(problem, PerchSettings(duration_max=share * shortest), VEHICLE)
 
 
-@pytest.mark.parametrize("seed", [700052, 700101, 700114, 700213])
+@pytest.mark.parametrize("seed", [700052, 700280, 700365, 700370])
 def test_a_search_that_fails_begins_again_from_other_durations(seed):
-    """Random problems that are planned from the first durations times 1.25 or 0.8 alone."""
+    """Random problems of which no plan is found from the first of `STARTS`."""
     problem = random_problem(np.random.default_rng(seed))
     assert checked(problem, PerchSettings()).iterations > search.STARTS[0][1]
 
