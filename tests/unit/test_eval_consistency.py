@@ -12,6 +12,7 @@ from perch_eval.evaluation import consistency as part
 from perch_eval.evaluation.document import Effort
 from perch_eval.flight import Flight, timed
 from perch_perception.ukf import Estimate
+from scipy.stats import chi2
 
 ZERO, WALL = np.zeros((6, 6)), np.array([0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5)])
 
@@ -54,6 +55,7 @@ def judged(seed, begin, shift=np.zeros(3), scale=1.0):
     return part.history(Flight({name: timed(values) for name, values in channels.items()}), states, biases)
 
 
+@pytest.mark.slow
 def test_errors_as_large_as_their_covariances_have_a_nees_of_one_per_dimension_and_larger_ones_do_not():
     """With perches planned at different times, an odometry that is off, and a vehicle that turns."""
     runs = [judged(seed, 2.5 + 0.1 * seed, shift=0.05 * np.ones(3)) for seed in range(3)]
@@ -72,6 +74,17 @@ def test_only_times_in_the_air_count_and_flights_without_a_planned_perch_do_not(
     assert part.history(Flight({"ground_truth/odometry": []}), [], []) == {}
 
 
+@pytest.mark.slow
+def test_a_flight_with_rendered_images_is_judged_by_its_true_states_and_biases():
+    """Its NEES is within what single samples of a consistent filter have; against biases of the other sensor, it would be far above."""
+    row = part._fly_seed(1)
+    assert row["cause"] == "perched" and 0.0 < row["metrics"]["nis_estimator"] < 2.0 and 0.1 < row["metrics"]["nis_vio"] < 2.0, row["message"]
+    for name, dimension in part.DIMENSIONS.items():
+        samples = np.array(row["history"][name], float)
+        assert np.isfinite(samples).sum() > 90 and 0.05 * dimension < np.nanmean(samples) < chi2.ppf(0.99, dimension), name
+
+
+@pytest.mark.slow
 def test_the_page_has_the_claim_on_the_mean_and_the_share_of_single_samples(tmp_path, monkeypatch):
     """Rows as they are read from the file of finished flights."""
     rng = np.random.default_rng(3)
