@@ -69,9 +69,9 @@ def consistency_sections(effort: Effort) -> list[Section]:
     out = Section("c_consistency", "Consistency of the estimators",
                   f"`{SCENARIO}` with both cameras rendered, seeds {seeds.start} to {seeds.stop - 1}, the flights of Table III among them; from "
                   f"{AIRBORNE_AFTER:g} s after take-off to the contact, by the time from the planned start of the perch, where at least half of the "
-                  f"flights are in the air; {len(flown)} of {len(flights)} flights planned one. Errors of VIO's start are drawn as declared (1 mm, 1 mrad). "
-                  "NEES per dimension, averaged over the flight; the "
-                  "share of the time in which the mean over the runs is inside its 95 % bounds, and above them (overconfident).")
+                  f"flights are in the air; {len(flown)} of {len(flights)} flights planned one. "
+                  "Errors of VIO's start are drawn as declared (1 mm, 1 mrad). NEES per dimension, averaged over the flight; the share of the time "
+                  "in which the mean over the runs is inside its 95 % bounds, and above them (overconfident).")
     if not flown:
         out.missing(STATES, "", "no flight planned a perch")
         return [out]
