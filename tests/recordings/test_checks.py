@@ -194,6 +194,14 @@ def test_an_impact_that_fades_out_in_the_first_window_of_a_rest_is_no_noise():
     assert "still for 1.0 s from 1.0 s on" in found["rest"].text and found["gyro noise"].level == "ok"
 
 
+def test_the_allan_deviation_at_rest_is_among_the_figures():
+    report, white = Report(), 0.01 * np.random.default_rng(8).standard_normal((2000, 6))
+    check_imu(report, 5_000_000 * np.arange(2000), white + (0.0, 0.0, 0.0, 0.0, 0.0, 9.81), None)
+    tau, gyro = np.array(report.figures["allan_tau_s"]), np.array(report.figures["allan_gyro"])
+    assert tau[-1] > 1.0 and len(report.figures["allan_accel"]) == len(tau)
+    assert gyro[0] * np.sqrt(tau[0]) == pytest.approx(0.01 / np.sqrt(200.0), rel=0.1)
+
+
 def test_rest_at_the_start_counts_though_another_is_longer():
     t = 0.005 * np.arange(2200)
     stamps = (1e9 * t).astype(np.int64)

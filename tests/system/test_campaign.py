@@ -81,8 +81,8 @@ def wait_for_results(folder: Path, count: int) -> None:
 
 
 def test_a_killed_campaign_resumes_to_the_200_results_of_an_undisturbed_one(campaign, tmp_path, capsys):
-    """Though one of two workers is killed in mid-run after that, too."""
-    process = subprocess.Popen(campaign("held", 200, "--jobs", "1"), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    """Though a worker is killed in mid-run after that, too."""
+    process = subprocess.Popen(campaign("held", 200), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for_results(tmp_path, 37)
     workers = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal.SIGKILL)
@@ -145,7 +145,7 @@ def test_a_killed_worker_of_a_cluster_loses_no_result_and_all_add_on_one_thread(
 
 
 def test_interrupt_keeps_what_is_finished_and_says_how_to_go_on(campaign, tmp_path):
-    process = subprocess.Popen(campaign("held", 200, "--jobs", "1"), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    process = subprocess.Popen(campaign("held", 200), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)
     wait_for_results(tmp_path, 20)
     os.killpg(process.pid, signal.SIGINT)

@@ -213,10 +213,11 @@ def test_rotors_that_are_led_anew_in_every_period_are_late_by_less_than_the_lead
 
 def test_the_law_that_stands_in_keeps_the_pace_of_the_odometry():
     law = predictive(RPG)
+    period_and_lag = 0.004, lag_behind(RPG.motor_time_constant, ControlGains().lead, 0.004)
     law.set_period(0.004)
-    assert law.fallback.period == 0.004
+    assert (law.fallback.period, law.fallback.lag) == period_and_lag
     law.retune(law.settings, GeometricController(RPG, ControlGains()))
-    assert law.fallback.period == 0.004
+    assert (law.fallback.period, law.fallback.lag) == period_and_lag
 
 
 def test_perch_with_estimation_errors():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,9 @@ from closed_loop.loop import make_loop, perch
 from closed_loop.plant import Disturbances
 from perch_control.admission import AtEnd, TrajectoryRefused
 from perch_control.l1 import L1Augmentation
+from perch_control.modes import State
 from perch_core.vehicle import load_vehicle
+from perch_eval.control_flights import comparison
 from perch_eval.control_flights.comparison import fly
 
 
@@ -44,3 +48,11 @@ def test_without_l1_nothing_is_made_of_it():
 @pytest.mark.parametrize("law, seed", [("geometric + L1", 1), ("nmpc + L1", 2)])
 def test_a_heavy_vehicle_perches_in_the_wind(law, seed):
     assert fly(law, "wind 5 m/s, mass +20 %", "perch", seed)[1] == "perched"
+
+
+@pytest.mark.parametrize("end, outcome", [("perched",) * 2, ("held with running motors",) * 2, ("in flight", "missed: tilt"), ("crashed",) * 2])
+def test_a_vehicle_that_is_held_has_not_missed(monkeypatch, end, outcome):
+    monkeypatch.setattr(comparison, "simulated_ending", lambda *_: end)
+    trace = SimpleNamespace(contacts=[SimpleNamespace(body="pad", reason="tilt")])
+    flight = SimpleNamespace(simulation=None, state=State.RECOVERING, loop=SimpleNamespace(trace=trace))
+    assert comparison._outcome(flight, "perch") == outcome

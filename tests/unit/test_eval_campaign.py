@@ -175,6 +175,8 @@ def test_more_runs_keep_the_first_ones(tmp_path):
     ("target.distanse: {uniform: [1.0, 2.0]}", "distanse"),
     ("target.distance: {uniform: [5.0, 6.0]}", "outside"),
     ("wind.steady.7: {uniform: [0.0, 1.0]}", "3 entries"), ("wind.gust_sigma.0: {uniform: [0.0, 1.0]}", "vary.wind.gust_sigma.0: gust_sigma is not a vector"),
+    ("target: {uniform: [1.0, 2.0]}", "c.yaml: vary.target: 'target' is a group, not a value"),
+    ("target.distance.far: {uniform: [1.0, 2.0]}", "c.yaml: vary.target.distance.far: 'distance' is a value, not a group"),
     ("seed: {grid: [.nan]}", "vary.seed.grid: .* are not all numbers"),
     ("seed: {grid: [1.5]}", "vary.seed: .* is not a grid or choice of whole numbers in .0, 2147483647."),
     ("seed: {grid: [one]}", "vary.seed"), ("seed: {uniform: [1, 2]}", "vary.seed"), ("seed: {choice: [-1]}", "vary.seed"),

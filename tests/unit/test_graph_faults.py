@@ -48,6 +48,8 @@ def test_every_node_is_struck_by_every_fault_in_every_phase_and_mode():
     (Situation(0.05, 0.0, 175.0, 300.0, False, True), "on the ground with running motors"),
     (Situation(1.2, 0.1, 2.0, 800.0, False, True), "hovering"),
     (Situation(1.2, 0.1, 2.0, 800.0, False, False), "in flight"),
+    (Situation(1.2, 0.29, 2.0, 800.0, False, True), "hovering"),
+    (Situation(1.2, 0.31, 2.0, 800.0, False, True), "in flight"),
     (Situation(1.2, 2.0, 2.0, 800.0, False, True), "in flight"),
     (Situation(1.2, 3.0, 2.0, 0.0, False, False), "in flight"),
 ])

@@ -31,6 +31,7 @@ LARGEST_SEED = 2**31 - 1
 RUNS_MAX = 20_000
 """Largest number of runs of a campaign, over all points of its grids."""
 KINDS = ("choice", "uniform", "normal", "grid")
+_DEFAULTS = config.flattened(asdict(Scenario(name="defaults")))
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,10 @@ class Campaign:
         for name, value in run.values.items():
             name, value = _field(flat, name, config.beside(self.file, value) if name in FILES["scenarios"] else value)
             flat[name] = list(value) if isinstance(value, tuple) else value
-        return config.nested(flat)
+        try:
+            return config.nested(flat)
+        except ConfigError as error:
+            raise ConfigError(str(self.file), f"vary.{error.key}", error.problem) from None
 
 
 def load_campaign(path: Path | str, engine: str | None = None, runs: int | None = None) -> Campaign:
@@ -191,7 +195,7 @@ def _field(flat: Mapping[str, Any], name: str, value: Any) -> tuple[str, Any]:
     vector, _, index = name.rpartition(".")
     if not (index.isascii() and index.isdigit()) or name.startswith("parameters."):
         return name, value
-    entries = flat.get(vector, config.flattened(asdict(Scenario(name="defaults"))).get(vector))
+    entries = flat.get(vector, _DEFAULTS.get(vector))
     if not isinstance(entries, list):
         raise ConfigError("campaign", f"vary.{name}", f"{vector.rpartition('.')[2]} is not a vector")
     if int(index) >= len(entries):

@@ -70,7 +70,7 @@ def _outcome(flight: ScriptedFlight, maneuver: str) -> str:
     if end == "crashed":
         return end
     if maneuver == "perch":
-        if end == "perched":
+        if end in ("perched", "held with running motors"):
             return end
         refused = next((c.reason for c in flight.loop.trace.contacts if c.body == "pad" and c.reason), "")
         return f"missed: {refused}" if refused else f"missed, {flight.state.name.lower()}"

@@ -165,7 +165,8 @@ def _check_noise(report: Report, imu: np.ndarray, rate: float, sensor: ImuSensor
     white = np.median(deviation[short] * np.sqrt(tau[short])[:, None], axis=0)
     gyro, accel = deviation[:, :3].max(axis=1), deviation[:, 3:].max(axis=1)
     densities = {"gyro": float(white[:3].max()), "accel": float(white[3:].max())}
-    report.figures |= {"gyro_noise_density": densities["gyro"], "accel_noise_density": densities["accel"]}
+    report.figures |= {"gyro_noise_density": densities["gyro"], "accel_noise_density": densities["accel"], "allan_tau_s": tau.tolist(),
+                       "allan_gyro": gyro.tolist(), "allan_accel": accel.tolist()}
     if tau[-1] >= 5.0:
         report.add("bias stability", f"gyro {gyro.min():.1e} rad/s, accelerometer {accel.min():.1e} m/s^2 (least Allan deviation)")
     for name, unit in (("gyro", "rad/s/sqrt(Hz)"), ("accel", "m/s^2/sqrt(Hz)")):
