@@ -145,6 +145,13 @@ def test_contradictory_bounds_are_not_called_solved():
     assert not answer.solved
 
 
+@pytest.mark.parametrize("at, bad", [(0, np.nan), (0, np.inf), (0, -np.inf), (1, np.nan), (1, np.inf), (2, np.nan), (2, -np.inf)])
+def test_rows_and_bounds_that_no_vector_keeps_end_unsolved(at, bad):
+    rows, lower, upper = np.array([[0.6, 0.8], [0.8, -0.6]]), np.array([0.5, 0.3]), np.array([1.0, 1.0])
+    (rows[:, 0], lower, upper)[at][1] = bad
+    assert not least_norm(rows, lower, upper).solved
+
+
 def test_end_conditions_and_continuity_are_exact():
     """[tests M:eq6, M:eq7]"""
     durations = np.array([0.7, 0.5, 0.5, 0.7])

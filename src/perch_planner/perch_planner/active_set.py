@@ -142,7 +142,7 @@ def _most_violated(rows: Array, lower: Array, upper: Array, w: Array, violated: 
             return -1, 0.0
         value = np.dot(rows[p], w)
         excess = max(lower[p] - value, value - upper[p])
-        if excess > 0.5 * earlier:
+        if excess >= 0.5 * earlier:
             beyond[p] = 0.0
             return p, excess
         beyond[p] = excess
@@ -201,7 +201,7 @@ def shortest(rows: Array, lower: Array, upper: Array, start: Array) -> tuple[Arr
                 to_drop, blocking = _first_zero(multipliers[:k], sign[:k], rate)
                 to_bound = excess / length**2 if length > _DEPENDENT else np.inf
                 step, steps = min(to_drop, to_bound), steps + 1
-                if step == np.inf or steps > steps_max:
+                if blocking < 0 and not to_bound < np.inf or steps > steps_max:
                     return w, dual, False
                 for j in range(k):
                     multipliers[j] -= step * rate[j]
