@@ -99,7 +99,7 @@ def test_two_libraries_find_the_same_minimum():
     peer.setup(sparse.identity(n, format="csc"), np.zeros(n), sparse.csc_matrix(matrix), lower, upper, verbose=False, eps_abs=1e-8, eps_rel=1e-8,
                max_iter=20000, polishing=True, scaling=0)
     own = solved(made, rows)
-    assert own == pytest.approx(reduced_qp.coefficients(made, np.asarray(peer.solve().x)), abs=1e-5)
+    assert own == pytest.approx(reduced_qp.coefficients(made, np.asarray(peer.solve(raise_error=True).x)), abs=1e-5)
     assert own == pytest.approx(reduced_qp.coefficients(made, daqp.solve(None, None, *rows[:1], upper, lower, np.zeros(len(lower), np.int32))[0]), abs=1e-9)
 
 
