@@ -258,6 +258,21 @@ def test_stamps_of_another_time_are_ignored_however_many_come_between(offset):
     np.testing.assert_allclose(flight.plant.p, [0, 0, 0.6], atol=0.03)
 
 
+def test_after_a_jump_of_time_samples_in_bursts_are_answered_by_a_descent():
+    """As from a driver that reads a FIFO: the first odometry of a burst is older than the last IMU sample of it."""
+    flight = hovering()
+    flight.stamp += 10 * NANOSECONDS
+    for _ in range(20):
+        stamps = range(flight.stamp, flight.stamp + 5 * flight.period, flight.period)
+        for stamp in stamps:
+            flight.component.on_imu(flight.imu(stamp=stamp))
+        for stamp in stamps:
+            flight.component.on_odometry(flight.odometry(stamp=stamp))
+        flight.stamp = stamps.stop
+    assert flight.state is State.LANDING and "time has jumped ahead" in flight.said
+    assert flight.motors[-1].stamp == flight.stamp - flight.period and flight.motors[-1].armed
+
+
 def test_a_little_older_stamps_are_refused_by_the_flight_and_move_nothing():
     flight = hovering()
     for _ in range(50):

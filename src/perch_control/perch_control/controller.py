@@ -137,7 +137,7 @@ class Controller(Component[ControllerParameters]):
 
     def _stamp_accepted(self, stamp: int, channel: str) -> bool:
         """Whether a stamp is accepted. If time has restarted, a new flight begins; if it has jumped, the vehicle descends."""
-        verdict = self._stamps.check(stamp, may_restart=not self.flight.flight_state.flying or self._inputs_lost)
+        verdict = self._stamps.check(stamp, channel, may_restart=not self.flight.flight_state.flying or self._inputs_lost)
         if verdict is Stamp.CURRENT:
             self._input_received = True
             return True

@@ -116,7 +116,7 @@ class Mission(Component[MissionParameters]):
             self._odometry = state
 
     def _stamp_accepted(self, stamp: int, channel: str) -> bool:
-        verdict = self._stamps.check(stamp)
+        verdict = self._stamps.check(stamp, channel)
         if verdict is Stamp.REFUSED:
             newest = seconds(self._stamps.newest)
             self.warn(f"{channel}: stamp {seconds(stamp):.3f} s is not current (newest: {newest:.3f} s): ignored",
@@ -127,7 +127,7 @@ class Mission(Component[MissionParameters]):
             if self._running is not None:
                 self._finish(self._running, stamp, Outcome(Result.TRACKING_LOST, "time has restarted"))
             self._begin()
-            self._stamps.check(stamp)
+            self._stamps.check(stamp, channel)
         return True
 
     def on_target(self, pose: TargetPose) -> None:
