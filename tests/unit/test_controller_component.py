@@ -80,6 +80,24 @@ def test_a_step_in_hover_takes_few_calls_of_kernels(monkeypatch):
     assert 50 <= len(called) <= 9 * 50, called[-12:]
 
 
+@pytest.mark.parametrize("command", [Command.DISARM, Command.ATTACHED])
+@pytest.mark.parametrize("imu", [True, False])
+def test_at_rest_it_does_not_arm_once_odometry_has_stopped(command, imu):
+    flight = Flight()
+    flight.step(0.5)
+    flight.order(command)
+    state = flight.state
+    for k in range(50):
+        flight.component.on_watchdog(77 * NANOSECONDS + k * 20_000_000)
+        flight.step(0.02, odometry=False, imu=imu)
+    flight.order(Command.ARM)
+    flight.step(0.02, odometry=False, imu=imu)
+    assert flight.state is state and "arm is refused: no usable odometry" in flight.said and not flight.motors[-1].armed
+    flight.step(0.1)
+    flight.order(Command.ARM)
+    assert flight.state is (State.RECOVERING if command is Command.ATTACHED else State.ARMED), "odometry is back"
+
+
 # -- silence -----------------------------------------------------------------------------------------------------------
 
 

@@ -18,7 +18,7 @@ from perch_core.surface import PerchSurface
 from perch_core.trajectory import SampledTrajectory, rest_to_rest
 from perch_core.values import (
     NANOSECONDS, ControllerStatus, EstimatorHealth, ImuSample, MappedPowerline, OdometryState, PerchGoal, PerchPlan, PowerlineMap, PowerlinePlan,
-    TargetPose, Transform, seconds)
+    TargetPose, Transform, TriggerRequest, seconds)
 from perch_core.vehicle import GRAVITY
 
 TICK, NAN = 20_000_000, float("nan")
@@ -336,6 +336,18 @@ def test_where_odometry_stops_the_hosts_time_goes_on():
     world.run(60.0)
     assert world.goal.result is not None and world.goal.result.error_code == Result.NOT_FOUND
     assert world.stamp - began < 15 * NANOSECONDS
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+def test_an_estimator_that_has_fallen_silent_is_not_ready_to_depart(odometry):
+    world, replies = World(), []
+    world.state = ControllerState.ATTACHED
+    world.run(0.5)
+    world.mission.on_estimator, world.odometry = lambda health: None, odometry
+    world.run(1.5)
+    world.mission.on_depart(TriggerRequest(), replies.append)
+    world.run(world.mission.config.mission.phase_timeout + 1.0)
+    assert not world.commands and not replies[0].success and "the estimator is not ready" in replies[0].message
 
 
 def test_ticks_without_new_odometry_do_nothing():

@@ -221,8 +221,9 @@ class Mission(Component[MissionParameters]):
     def _inputs(self, running: RunningGoal, time: float, x: OdometryState) -> Inputs:
         status, estimator = self._status, self._estimator
         state = State(np.array(x.p_WB), np.array(x.q_WB), np.array(x.v_WB), np.array(x.w_B))
+        ready = estimator is not None and estimator.state == RUNNING and nanoseconds(time) - estimator.stamp <= STALE
         return Inputs(
-            time=time, state=state, estimator_ready=estimator is not None and estimator.state == RUNNING,
+            time=time, state=state, estimator_ready=ready,
             controller=ControllerState(status.state) if status else ControllerState.DISARMED,
             controller_message=status.message if status else "no controller/status yet",
             trajectory_id=status.trajectory_id if status else 0,
