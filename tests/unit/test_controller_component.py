@@ -80,6 +80,24 @@ def test_a_step_in_hover_takes_few_calls_of_kernels(monkeypatch):
     assert 50 <= len(called) <= 9 * 50, called[-12:]
 
 
+@pytest.mark.parametrize("command", [Command.DISARM, Command.ATTACHED])
+@pytest.mark.parametrize("imu", [True, False])
+def test_at_rest_it_does_not_arm_once_odometry_has_stopped(command, imu):
+    flight = Flight()
+    flight.step(0.5)
+    flight.order(command)
+    state = flight.state
+    for k in range(50):
+        flight.component.on_watchdog(77 * NANOSECONDS + k * 20_000_000)
+        flight.step(0.02, odometry=False, imu=imu)
+    flight.order(Command.ARM)
+    flight.step(0.02, odometry=False, imu=imu)
+    assert flight.state is state and "arm is refused: no usable odometry" in flight.said and not flight.motors[-1].armed
+    flight.step(0.1)
+    flight.order(Command.ARM)
+    assert flight.state is (State.RECOVERING if command is Command.ATTACHED else State.ARMED), "odometry is back"
+
+
 # -- silence -----------------------------------------------------------------------------------------------------------
 
 
@@ -256,6 +274,21 @@ def test_stamps_of_another_time_are_ignored_however_many_come_between(offset):
     assert flight.state is State.HOVERING and "not current" in flight.said
     assert max(m.stamp for m in flight.motors) < flight.stamp
     np.testing.assert_allclose(flight.plant.p, [0, 0, 0.6], atol=0.03)
+
+
+def test_after_a_jump_of_time_samples_in_bursts_are_answered_by_a_descent():
+    """As from a driver that reads a FIFO: the first odometry of a burst is older than the last IMU sample of it."""
+    flight = hovering()
+    flight.stamp += 10 * NANOSECONDS
+    for _ in range(20):
+        stamps = range(flight.stamp, flight.stamp + 5 * flight.period, flight.period)
+        for stamp in stamps:
+            flight.component.on_imu(flight.imu(stamp=stamp))
+        for stamp in stamps:
+            flight.component.on_odometry(flight.odometry(stamp=stamp))
+        flight.stamp = stamps.stop
+    assert flight.state is State.LANDING and "time has jumped ahead" in flight.said
+    assert flight.motors[-1].stamp == flight.stamp - flight.period and flight.motors[-1].armed
 
 
 def test_a_little_older_stamps_are_refused_by_the_flight_and_move_nothing():

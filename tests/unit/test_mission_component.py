@@ -18,7 +18,7 @@ from perch_core.surface import PerchSurface
 from perch_core.trajectory import SampledTrajectory, rest_to_rest
 from perch_core.values import (
     NANOSECONDS, ControllerStatus, EstimatorHealth, ImuSample, MappedPowerline, OdometryState, PerchGoal, PerchPlan, PowerlineMap, PowerlinePlan,
-    TargetPose, Transform, seconds)
+    TargetPose, Transform, TriggerRequest, seconds)
 from perch_core.vehicle import GRAVITY
 
 TICK, NAN = 20_000_000, float("nan")
@@ -43,7 +43,7 @@ class Sent:
 
 
 class World:
-    """A controller that obeys, a pad in view, velcro that holds; a planner as told. IMU at a rate of its own."""
+    """A controller that obeys, a pad in view, velcro that holds; a planner as told. IMU at a rate of its own; lazy inputs in batches."""
 
     def __init__(self, planner=None, period=10_000_000, params=None, **goal):
         self.mission = Mission(params or MissionParameters())
@@ -91,9 +91,11 @@ class World:
         if self.contact is not None and time >= self.contact:
             self.q = tuple(Q_PERCH)
         force = tuple(so3.quat_rotate(so3.quat_conjugate(np.array(self.q)), [0, 0, GRAVITY]).tolist())
-        for stamp in range(self.stamp - TICK + self.period, self.stamp + 1, self.period):
+        stamps = range(self.stamp - TICK + self.period, self.stamp + 1, self.period)
+        for stamp in stamps:
             self.mission.on_imu(ImuSample(stamp, (0.0,) * 3, tuple(f * s for f, s in zip(force, self.turn, strict=True)), self.imu_frame))
-            if self.odometry:
+        if self.odometry:
+            for stamp in stamps:
                 self.mission.on_odometry(OdometryState(stamp, tuple(map(float, self.p)), self.q, (0.0,) * 3, (0.0,) * 3, self.covariance, NONE))
         self.mission.on_status(ControllerStatus(self.stamp, int(self.state), "geometric", self.id, 0.0, 0.0, 0.0, 0.0, 1.0, self.thrust_ratio, "says so"))
         self.mission.on_estimator(EstimatorHealth(self.stamp, 1, 0.0, 1, 0, 0.0, (0.0,) * 3, (0.0,) * 3, 0.0, 0.0, ""))
@@ -336,6 +338,18 @@ def test_where_odometry_stops_the_hosts_time_goes_on():
     assert world.stamp - began < 15 * NANOSECONDS
 
 
+@pytest.mark.parametrize("odometry", [True, False])
+def test_an_estimator_that_has_fallen_silent_is_not_ready_to_depart(odometry):
+    world, replies = World(), []
+    world.state = ControllerState.ATTACHED
+    world.run(0.5)
+    world.mission.on_estimator, world.odometry = lambda health: None, odometry
+    world.run(1.5)
+    world.mission.on_depart(TriggerRequest(), replies.append)
+    world.run(world.mission.config.mission.phase_timeout + 1.0)
+    assert not world.commands and not replies[0].success and "the estimator is not ready" in replies[0].message
+
+
 def test_ticks_without_new_odometry_do_nothing():
     world, decided = World().send().run(1.0), []
     decide = world.mission._decide
@@ -437,6 +451,14 @@ def test_a_vehicle_that_was_started_again_ends_the_goal_and_takes_the_next():
     world.goal = Sent(PerchGoal())
     world.send().run()
     assert world.goal.ending == "succeeded"
+
+
+@pytest.mark.parametrize("period", [2_000_000, 10_000_000])
+def test_a_clock_that_was_set_ahead_between_goals_costs_no_goal(period):
+    world = World(period=period).run(0.2)
+    world.stamp += 10 * NANOSECONDS
+    world.run(0.2)
+    assert "not current" in world.said and world.send().run().goal.ending == "succeeded"
 
 
 # -- powerlines --------------------------------------------------------------------------------------------------------

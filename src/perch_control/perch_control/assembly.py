@@ -51,7 +51,9 @@ class Assembly:
             ConfigError: there is no such law.
         """
         self._params, self.vehicle = params, vehicle
-        self._failed: dict[str, tuple[str, Callable[[], None]]] = {}  # why, and how to try it again
+        self._work: Callable[[Job], None] | None = None  # None: no slow law is prepared yet
+        self._log: Callable[[str], None]
+        self._failed: dict[str, str] = {}  # slow law that could not be built -> why
         self._segments: Sequence[Segment] = ()
         choice = params.controller
         self.laws: dict[str, Law] = {choice.type: build_law(choice.type, vehicle, params)}
@@ -81,16 +83,16 @@ class Assembly:
             work: runs a job in the background.
             log: logs which law could not be built.
         """
+        self._work, self._log = work, log
         for name in LAWS:
             if name not in self.laws and law_class(name).slow:
-                self._prepare(name, work, log)
+                self._prepare(name)
 
-    def _prepare(self, name: str, work: Callable[[Job], None], log: Callable[[str], None]) -> None:
-        params = self._params
-        work(Job(build_law, (name, self.vehicle, params), partial(self._prepared, name, params, work, log)))
+    def _prepare(self, name: str) -> None:
+        if self._work is not None:
+            self._work(Job(build_law, (name, self.vehicle, self._params), partial(self._prepared, name, self._params)))
 
-    def _prepared(self, name: str, params: ControllerParameters, work: Callable[[Job], None], log: Callable[[str], None],
-                  built: Law | Exception) -> None:
+    def _prepared(self, name: str, params: ControllerParameters, built: Law | Exception) -> None:
         law: Law | Exception | None = built
         if params is not self._params:  # gains were changed in the meantime
             try:
@@ -98,11 +100,11 @@ class Assembly:
             except ConfigError:
                 law = None
         if law is None:
-            self._prepare(name, work, log)
+            self._prepare(name)
             return
         if isinstance(law, Exception):
-            self._failed[name] = str(law), partial(self._prepare, name, work, log)
-            log(f"{name} could not be built: {law}")
+            self._failed[name] = str(law)
+            self._log(f"{name} could not be built: {law}")
             return
         self.laws[name] = law
         self._update_lines(law)
@@ -129,30 +131,34 @@ class Assembly:
         """Use new gains and limits from the next step on, and another law or augmentation where these have changed.
 
         Raises:
-            ConfigError: a parameter that is fixed after the start has changed, or the law is not ready; nothing is changed.
+            ConfigError: a parameter that is fixed after the start has changed, or the law is not ready, or would take long to be
+                built again in flight; nothing is changed.
         """
-        flight, old = self.flight, self._params
-        choice, active_law = params.controller, self.active_law
-        if choice.type != old.controller.type and choice.type not in self.laws and law_class(choice.type).slow:
-            raise ConfigError("", "controller.type", self._not_ready_reason(choice.type))
-        changed = {name: law.retuned(params) for name, law in self.laws.items()}
-        if changed[active_law] is None:
-            changed[active_law] = build_law(active_law, self.vehicle, params)
+        flight, old, choice = self.flight, self._params, params.controller
+        chosen = choice.type if choice.type != old.controller.type else self.active_law  # what the service has chosen stays otherwise
+        slow = law_class(chosen).slow
+        if chosen not in self.laws and slow:
+            raise ConfigError("", "controller.type", self._not_ready_reason(chosen))
+        law = self.laws[chosen].retuned(params) if chosen in self.laws else None
+        if law is None:
+            if slow and flight.flight_state.flying:
+                raise ConfigError("", "controller.type", f"{chosen} takes long to be built with other parameters: not in flight")
+            law = build_law(chosen, self.vehicle, params)
+        changed = {chosen: law} | {name: other.retuned(params) for name, other in self.laws.items() if name != chosen}
         self._params = params
         self.laws = {name: law for name, law in changed.items() if law is not None}
         if flight.compensator is not None:
             flight.compensator.bandwidth = choice.l1_bandwidth
-        # What the service has chosen stays where the parameter has not changed.
         adaptive = flight.compensator is not None
-        self.choose(choice.type if choice.type != old.controller.type else active_law,
-                    choice.adaptive if choice.adaptive != old.controller.adaptive else adaptive)
+        self.choose(chosen, choice.adaptive if choice.adaptive != old.controller.adaptive else adaptive)
+        dropped = [name for name, law in changed.items() if law is None and law_class(name).slow]
         failed, self._failed = self._failed, {}
-        for _, retry in failed.values():
-            retry()
+        for name in (*dropped, *failed):
+            self._prepare(name)
 
     def _not_ready_reason(self, name: str) -> str:
         """Return why a slow law is not available."""
-        return f"{name} could not be built: {self._failed[name][0]}" if name in self._failed else f"{name} is not ready: it is being built"
+        return f"{name} could not be built: {self._failed[name]}" if name in self._failed else f"{name} is not ready: it is being built"
 
     # -- references and lines ----------------------------------------------------------------------------------------
 

@@ -75,8 +75,8 @@ class Controller(Component[ControllerParameters]):
         self._assembly = Assembly(config, vehicle)
         self._axes = ImuAxes(self.warn, config.sensors)
         self._stamps = StampGuard()
-        self._last_input_time: int | None = None  # the host's time of the last check of the watchdog after an input [ns]
-        self._input_received, self._inputs_lost = False, False
+        self._silent_since: int | None = None  # the host's time of the first check of the watchdog since the last input [ns]
+        self._silence = 0                      # from then to its last check [ns]
         self._map_stamp = 0                               # of the map of powerlines [ns]
         self._begin()
 
@@ -137,38 +137,34 @@ class Controller(Component[ControllerParameters]):
 
     def _stamp_accepted(self, stamp: int, channel: str) -> bool:
         """Whether a stamp is accepted. If time has restarted, a new flight begins; if it has jumped, the vehicle descends."""
-        verdict = self._stamps.check(stamp, may_restart=not self.flight.flight_state.flying or self._inputs_lost)
-        if verdict is Stamp.CURRENT:
-            self._input_received = True
-            return True
+        may_restart = not self.flight.flight_state.flying or self._silence >= INPUTS_LOST_AFTER
+        verdict = self._stamps.check(stamp, channel, may_restart)
         if verdict is Stamp.REFUSED:
             newest = seconds(self._stamps.newest)
             self.warn(f"{channel}: stamp {seconds(stamp):.3f} s is not current (newest: {newest:.3f} s): ignored",
                       min_interval=1.0)
             return False
+        self._silent_since, self._silence = None, 0
         if verdict is Stamp.RESTARTED:
             self.warn(f"{channel}: time has restarted at {seconds(stamp):.3f} s: new flight, disarmed")
             self._assembly.restart()
             self._begin()
             if self._map_stamp > stamp + STALE:  # of the time before; an old one, which may be published only once, stays valid
                 self._assembly.set_lines(())
-        else:
+        elif verdict is Stamp.AHEAD:
             self.warn(f"{channel}: time has jumped ahead to {seconds(stamp):.3f} s")
             self.flight.descend("time has jumped ahead")
-        self._input_received = True
         return True
 
     # -- silence -----------------------------------------------------------------------------------------------------
 
     def on_watchdog(self, now: int) -> None:
         """Descend without position where neither odometry nor IMU samples arrive in flight."""
-        if self._input_received or self._last_input_time is None or now < self._last_input_time:
-            self._input_received, self._last_input_time, self._inputs_lost = False, now, False
-            return
-        silent = now - self._last_input_time
-        self._inputs_lost = silent >= INPUTS_LOST_AFTER
-        if self.flight.flight_state.flying and silent >= nanoseconds(BLIND_AFTER):
-            self._answer_silence(self._stamps.newest + silent, "neither odometry nor IMU: descending by the clock")
+        if self._silent_since is None or now < self._silent_since:
+            self._silent_since = now
+        self._silence = now - self._silent_since
+        if self.flight.flight_state.flying and self._silence >= nanoseconds(BLIND_AFTER):
+            self._answer_silence(self._stamps.newest + self._silence, "neither odometry nor IMU: descending by the clock")
 
     def _answer_silence(self, stamp: int, why: str) -> None:
         if not self._silent:
@@ -202,12 +198,25 @@ class Controller(Component[ControllerParameters]):
             self.warn(f"command {command.command} of {seconds(command.stamp):.3f} s is too old: ignored")
             return
         try:
-            if command.command == Command.ARM and not self._to_vehicle.has_receivers:
-                raise CommandRefused("arm is refused: no vehicle has subscribed to the commands yet")
+            if command.command == Command.ARM:
+                self._check_arming()
             self.flight.command(Command(command.command), command.reason[:_REASON_LENGTH])
         except ValueError as error:  # CommandRefused, or no such command
             self.flight.report_refusal(str(error))
             self.warn(f"command: {error}")
+
+    def _check_arming(self) -> None:
+        """Check that a vehicle listens, and that odometry arrives: at rest, its age in `flight` does not advance without it.
+
+        Raises:
+            CommandRefused: the motors may not start.
+        """
+        if not self._to_vehicle.has_receivers:
+            raise CommandRefused("arm is refused: no vehicle has subscribed to the commands yet")
+        if self._answered is None or self.flight.state not in (State.DISARMED, State.ATTACHED):
+            return
+        if self._stamps.newest + self._silence - self._answered >= nanoseconds(BLIND_AFTER):
+            raise CommandRefused("arm is refused: no usable odometry")
 
     def on_powerlines(self, lines: PowerlineMap) -> None:
         """Pass the map to the laws that use it. The topic is latched, so an old map is valid; one from the future is ignored."""

@@ -68,6 +68,8 @@ class Law(ABC):
     def retuned(self, params: ControllerParameters) -> Law | None:
         """Apply new parameters in flight; return the law with these, or None where it must be rebuilt.
 
+        A slow law that must be rebuilt refuses new parameters where it is in use in flight.
+
         Raises:
             ConfigError: one of them is fixed after the start; the law is unchanged.
         """

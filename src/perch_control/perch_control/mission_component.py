@@ -116,7 +116,7 @@ class Mission(Component[MissionParameters]):
             self._odometry = state
 
     def _stamp_accepted(self, stamp: int, channel: str) -> bool:
-        verdict = self._stamps.check(stamp)
+        verdict = self._stamps.check(stamp, channel)
         if verdict is Stamp.REFUSED:
             newest = seconds(self._stamps.newest)
             self.warn(f"{channel}: stamp {seconds(stamp):.3f} s is not current (newest: {newest:.3f} s): ignored",
@@ -127,7 +127,7 @@ class Mission(Component[MissionParameters]):
             if self._running is not None:
                 self._finish(self._running, stamp, Outcome(Result.TRACKING_LOST, "time has restarted"))
             self._begin()
-            self._stamps.check(stamp)
+            self._stamps.check(stamp, channel)
         return True
 
     def on_target(self, pose: TargetPose) -> None:
@@ -221,8 +221,9 @@ class Mission(Component[MissionParameters]):
     def _inputs(self, running: RunningGoal, time: float, x: OdometryState) -> Inputs:
         status, estimator = self._status, self._estimator
         state = State(np.array(x.p_WB), np.array(x.q_WB), np.array(x.v_WB), np.array(x.w_B))
+        ready = estimator is not None and estimator.state == RUNNING and nanoseconds(time) - estimator.stamp <= STALE
         return Inputs(
-            time=time, state=state, estimator_ready=estimator is not None and estimator.state == RUNNING,
+            time=time, state=state, estimator_ready=ready,
             controller=ControllerState(status.state) if status else ControllerState.DISARMED,
             controller_message=status.message if status else "no controller/status yet",
             trajectory_id=status.trajectory_id if status else 0,

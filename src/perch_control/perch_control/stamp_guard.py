@@ -6,7 +6,7 @@ from enum import Enum
 
 _JUMP = 1_000_000_000    # further behind the newest stamp than this, a stamp is not current [ns] ...
 _AHEAD = 80_000_000      # the same ahead of it [ns] ...
-_CONFIRM = 50_000_000    # ... unless only such stamps, consistent with each other, have arrived for so long [ns]
+_CONFIRM = 50_000_000    # ... unless one stream has had such stamps, increasing, for so long, and none was current [ns]
 
 
 class Stamp(Enum):
@@ -28,24 +28,27 @@ class StampGuard:
 
     def __init__(self) -> None:
         self.newest, self.initialised = 0, False
-        self._first = self._last = -1  # first and last of consecutive stamps that are not current [ns]
+        self._unconfirmed: dict[str, tuple[int, int]] = {}  # stream -> first and last of its stamps that are not current [ns]
 
-    def check(self, stamp: int, may_restart: bool = True) -> Stamp:
-        """Check a stamp [ns] of any of the streams.
+    def check(self, stamp: int, stream: str, may_restart: bool = True) -> Stamp:
+        """Check a stamp.
 
         Args:
-            stamp: stamps are passed in the order of arrival; one slightly older than the newest is accepted, too.
+            stamp: in the order of arrival [ns]; one slightly older than the newest is accepted, too.
+            stream: name of its stream. Streams may be read one after the other, in batches.
             may_restart: whether time may restart; otherwise stamps of the past are always refused.
         """
         newest = self.newest
         if not self.initialised or -_JUMP <= stamp - newest <= _AHEAD:
-            self._first = -1
+            self._unconfirmed.clear()
             self.newest, self.initialised = max(stamp, newest) if self.initialised else stamp, True
             return Stamp.CURRENT
-        if self._first < 0 or not 0 <= stamp - self._last <= _JUMP:
-            self._first = stamp
-        self._last = stamp
-        if stamp - self._first < _CONFIRM or (stamp < newest and not may_restart):
+        first, last = self._unconfirmed.get(stream, (stamp, stamp))
+        if not 0 <= stamp - last <= _JUMP:
+            first = stamp
+        self._unconfirmed[stream] = first, stamp
+        if stamp - first < _CONFIRM or (stamp < newest and not may_restart):
             return Stamp.REFUSED
-        self.newest, self._first = stamp, -1
+        self.newest = stamp
+        self._unconfirmed.clear()
         return Stamp.AHEAD if stamp > newest else Stamp.RESTARTED
