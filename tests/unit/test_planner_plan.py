@@ -14,6 +14,7 @@ from perch_planner import refusals, relaxation, search
 from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint, contact_heading
 from perch_planner.refusals import PerchRefusal
+from perch_planner.time_allocation import FINE_DIVISIONS
 from perch_planner.plan_output import requirements
 from perch_planner.verifier import verify
 from random_perches import paper_like_problem, random_problem, shipped_settings
@@ -330,6 +331,18 @@ def test_durations_grow_to_duration_max_before_a_refusal():
     problem, wanted = PerchProblem(HOVER, surface(90.0), segment_times=(0.5,)), PerchSettings()
     grown = plan(problem, wanted, VEHICLE).duration
     assert checked(problem, replace(wanted, duration_max=0.97 * grown)).duration <= 0.97 * grown
+
+
+@pytest.mark.parametrize("early", [{1}, {4}, {5}, {6}, {4, 5}, {4, 5, 6, 7}])
+def test_durations_of_duration_max_are_tried_with_all_divisions_of_the_approach(early, monkeypatch):
+    """`early`: numbers of the tries whose thrust leaves its range before the last waypoint. Those durations grow at once."""
+    problem, tried = PerchProblem(HOVER, surface(90.0, p=(3.0, 0.0, 1.5)), (Waypoint((1.0, 0.0, 1.5)),)), []
+    searched = search.Search(problem, PerchSettings(), VEHICLE, Limits.of(PerchSettings(), VEHICLE))
+    monkeypatch.setattr(searched, "try_durations", lambda durations, allow_stretch: tried.append(durations) or search.Outcome(durations, stretch=20.0))
+    monkeypatch.setattr(searched, "fails_early", lambda durations, outcome: len(tried) in early)
+    searched._run_from(searched.initial_durations)
+    last = [tuple(durations) for durations in tried if durations.sum() == pytest.approx(20.0)]
+    assert len(last) == len(set(last)) == 1 + len(FINE_DIVISIONS)
 
 
 def test_a_duration_max_without_room_for_the_tube_is_refused():

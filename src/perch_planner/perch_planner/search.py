@@ -173,13 +173,13 @@ class Search:
                 fitted = None if at_maximum else shortened(durations, self.settings)
                 if fitted is None:
                     return Found(durations, fails, best or Outcome(durations))
-                durations, at_maximum, fails = fitted, True, max(fails, _COARSE_TRIALS - 1)
+                durations, at_maximum, fails = fitted, True, _COARSE_TRIALS - 1
             outcome = self.try_durations(divided_durations(durations, fails), allow_stretch=stretched < _EARLY_STRETCHES)
             if outcome.proved:
                 return Found(durations, fails, outcome)
             if best is None or len(outcome.results):
                 best = outcome
-            if self.fails_early(durations, outcome):
+            if not at_maximum and self.fails_early(durations, outcome):
                 grown, stretched = outcome.stretch * durations, stretched + 1
             elif division_index(fails := fails + 1) < len(FINE_DIVISIONS):
                 grown = durations  # the same, with another division
