@@ -351,6 +351,17 @@ def test_a_duration_max_without_room_for_the_tube_is_refused():
     assert set(caught.value.relaxed) == {"duration_max"}
 
 
+@pytest.mark.parametrize("duration, divisions", [(3.0, 1 + len(FINE_DIVISIONS)), (0.8, 1)])
+def test_a_shorter_duration_is_tried_once_with_each_division_of_the_approach(duration, divisions, monkeypatch):
+    """A short approach is not divided. The division of the longer plan is tried first."""
+    tried, searched = [], search.Search(PerchProblem(HOVER, surface(90.0)), PerchSettings(), VEHICLE, Limits.of(PerchSettings(), VEHICLE))
+    monkeypatch.setattr(searched, "try_durations", lambda durations: tried.append(tuple(durations)) or search.Outcome(durations))
+    for first in range(9):
+        tried.clear()
+        assert searched._try_divisions(np.array([duration]), first) is None
+        assert len(tried) == len(set(tried)) == divisions and tried[0] == tuple(search.divided_durations(np.array([duration]), first))
+
+
 def test_settings_may_be_integers():
     problem = PerchProblem(HOVER, surface(90.0))
     planned = plan(problem, replace(PerchSettings(), clearance_min=0, thrust_max=4, duration_max=20), VEHICLE)

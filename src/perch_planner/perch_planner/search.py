@@ -221,10 +221,16 @@ class Search:
         return outcome
 
     def _try_divisions(self, durations: np.ndarray | None, first: int) -> Outcome | None:
-        """Return a plan with these durations and any division of the approach; that after `first` failures is tried first."""
-        for fails in (first, *range(_COARSE_TRIALS - 1, _COARSE_TRIALS + len(FINE_DIVISIONS))):
-            if durations is not None and self.iterations < self._iterations_end:
-                tried = self.try_durations(divided_durations(durations, fails))
+        """Return a plan with these durations and any division of the approach; that after `first` failures is tried first.
+
+        Each is tried once: that of `first` is also one of the others, and a short approach has only one.
+        """
+        if durations is None:
+            return None
+        divisions = [divided_durations(durations, fails) for fails in (first, *range(_COARSE_TRIALS - 1, _COARSE_TRIALS + len(FINE_DIVISIONS)))]
+        for divided in {tuple(d.tolist()): d for d in divisions}.values():
+            if self.iterations < self._iterations_end:
+                tried = self.try_durations(divided)
                 if tried.proved:
                     return tried
         return None
