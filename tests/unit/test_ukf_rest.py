@@ -58,7 +58,7 @@ class Resting:
 @pytest.mark.parametrize("attitude, minutes", [("wall", 4.0), ("ground", 1.0), ("upside down", 1.0)])
 @pytest.mark.slow
 def test_the_covariance_does_not_grow_and_is_honest(attitude, minutes):
-    """Minutes; what does not grow in four does not grow in sixty (an hour was run once: docs/estimation.md)."""
+    """Minutes; what does not grow in four does not grow in sixty."""
     resting = Resting(attitude=attitude).run(10.0)
     before = resting.sigma
     resting.run(60.0 * minutes - 10.0)
