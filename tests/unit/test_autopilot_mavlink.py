@@ -573,6 +573,25 @@ def test_a_link_that_has_ended_is_opened_anew(autopilot, monkeypatch):
     assert [line.text for line in autopilot.got["log"][:2]] == ["the link to the autopilot has ended", f"{autopilot.node.config.link}: cannot be opened"]
 
 
+def test_a_link_that_is_opened_anew_in_flight_gives_no_thrust_of_a_controller_that_is_started_again(autopilot, monkeypatch):
+    """Until a heartbeat has the autopilot disarmed."""
+    m = autopilot.mavlink
+    autopilot.say(m.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
+    autopilot.heard(1.0)
+    ours, theirs = socket.socketpair()
+    monkeypatch.setattr("perch_autopilot.mavlink.Link", lambda _: Link(f"fd:{ours.detach()}"))
+    autopilot.link.close()
+    autopilot.link = theirs
+    autopilot.heard(0.3)
+    for disarmed in (False, True):
+        if disarmed:
+            autopilot.say(m.heartbeat_encode(2, PX4, 0, OFFBOARD, 4))
+            autopilot.heard()
+        for _ in range(20):
+            autopilot.node.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
+            assert ("SET_ATTITUDE_TARGET" in autopilot.heard()) == disarmed
+
+
 @pytest.mark.parametrize("options", [None, 0.0, 8.0])
 def test_a_link_that_is_opened_anew_gives_ardupilot_set_points_as_before(options, monkeypatch):
     """None or all, also before its first heartbeat and its parameter have come again."""

@@ -70,7 +70,7 @@ def test_gate_does_not_take_a_jump_at_which_the_odometry_lost_itself_until_it_is
     def taken(begin, sigma):
         covariances = tuple(np.array(c) for c in drifted)
         covariances[k][axes, axes] += sigma**2 * np.eye(3)
-        verdicts = [gate.check(begin + 0.002 * n, there, covariances) for n in range(1, 40)]
+        verdicts = [gate.check(begin + 0.002 * n, there, covariances, flying=True) for n in range(1, 40)]
         return any(v.usable for v in verdicts), verdicts[-1].reason
 
     usable, reason = taken(1.0, 1.1 * limit)
@@ -78,10 +78,17 @@ def test_gate_does_not_take_a_jump_at_which_the_odometry_lost_itself_until_it_is
     assert taken(1.1, 0.9 * limit)[0]
 
 
+def test_at_rest_gate_takes_odometry_that_begins_anew_elsewhere_however_uncertain():
+    gate = OdometryGate()
+    gate.check(1.0, REST, (1e-4 * np.eye(6), 1e-4 * np.eye(6)))
+    verdicts = [gate.check(1.0 + 0.002 * n, moved(REST, p=(1, 0, 1)), (4.0 * np.eye(6), np.eye(6)), flying=False) for n in range(1, 20)]
+    assert not verdicts[0].usable and any(v.jumped for v in verdicts)
+
+
 def test_gate_takes_a_jump_of_odometry_whose_velocity_has_no_covariance():
     gate, none = OdometryGate(), (np.zeros((6, 6)), -np.eye(6))
     gate.check(1.0, REST, none)
-    assert any(gate.check(1.0 + 0.002 * k, moved(REST, p=(1, 0, 1)), none).jumped for k in range(1, 20))
+    assert any(gate.check(1.0 + 0.002 * k, moved(REST, p=(1, 0, 1)), none, flying=True).jumped for k in range(1, 20))
 
 
 def test_gate_lets_fast_flight_pass():

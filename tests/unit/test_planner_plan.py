@@ -14,6 +14,7 @@ from perch_planner import refusals, relaxation, search
 from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState, Waypoint, contact_heading
 from perch_planner.refusals import PerchRefusal
+from perch_planner.time_allocation import FINE_DIVISIONS
 from perch_planner.plan_output import requirements
 from perch_planner.verifier import verify
 from random_perches import paper_like_problem, random_problem, shipped_settings
@@ -332,10 +333,33 @@ def test_durations_grow_to_duration_max_before_a_refusal():
     assert checked(problem, replace(wanted, duration_max=0.97 * grown)).duration <= 0.97 * grown
 
 
+@pytest.mark.parametrize("early", [{1}, {4}, {5}, {6}, {4, 5}, {4, 5, 6, 7}])
+def test_durations_of_duration_max_are_tried_with_all_divisions_of_the_approach(early, monkeypatch):
+    """`early`: numbers of the tries whose thrust leaves its range before the last waypoint. Those durations grow at once."""
+    problem, tried = PerchProblem(HOVER, surface(90.0, p=(3.0, 0.0, 1.5)), (Waypoint((1.0, 0.0, 1.5)),)), []
+    searched = search.Search(problem, PerchSettings(), VEHICLE, Limits.of(PerchSettings(), VEHICLE))
+    monkeypatch.setattr(searched, "try_durations", lambda durations, allow_stretch: tried.append(durations) or search.Outcome(durations, stretch=20.0))
+    monkeypatch.setattr(searched, "fails_early", lambda durations, outcome: len(tried) in early)
+    searched._run_from(searched.initial_durations)
+    last = [tuple(durations) for durations in tried if durations.sum() == pytest.approx(20.0)]
+    assert len(last) == len(set(last)) == 1 + len(FINE_DIVISIONS)
+
+
 def test_a_duration_max_without_room_for_the_tube_is_refused():
     with pytest.raises(PerchRefusal) as caught:
         plan(PerchProblem(HOVER, surface(90.0)), PerchSettings(duration_max=0.2), VEHICLE)
     assert set(caught.value.relaxed) == {"duration_max"}
+
+
+@pytest.mark.parametrize("duration, divisions", [(3.0, 1 + len(FINE_DIVISIONS)), (0.8, 1)])
+def test_a_shorter_duration_is_tried_once_with_each_division_of_the_approach(duration, divisions, monkeypatch):
+    """A short approach is not divided. The division of the longer plan is tried first."""
+    tried, searched = [], search.Search(PerchProblem(HOVER, surface(90.0)), PerchSettings(), VEHICLE, Limits.of(PerchSettings(), VEHICLE))
+    monkeypatch.setattr(searched, "try_durations", lambda durations: tried.append(tuple(durations)) or search.Outcome(durations))
+    for first in range(9):
+        tried.clear()
+        assert searched._try_divisions(np.array([duration]), first) is None
+        assert len(tried) == len(set(tried)) == divisions and tried[0] == tuple(search.divided_durations(np.array([duration]), first))
 
 
 def test_settings_may_be_integers():
@@ -391,13 +415,11 @@ def test_the_clearance_that_a_refusal_names_is_near_what_a_plan_takes():
     assert -0.1 < caught.value.relaxed["clearance_min"] < settings.clearance_min
 
 
-def test_values_that_remove_limits_are_valid_settings():
+def test_values_that_remove_limits_are_the_loosest_valid_settings():
+    """Else every plan violates a looser limit. A least thrust of 0 stands for the vehicle's."""
     ranges = {field.name: field.metadata for field in fields(PerchSettings)}
-    for name, limit in relaxation._LIMITS.items():
-        assert ranges[name]["low"] is None or ranges[name]["low"] <= limit.unlimited
-        assert limit.unlimited <= ranges[name]["high"]
-    assert relaxation._LIMITS["thrust_max"].unlimited == ranges["thrust_max"]["high"]
-    assert relaxation._LIMITS["body_rate_max"].unlimited == ranges["body_rate_max"]["high"]
+    loosest = {name: ranges[name]["high" if name.endswith("_max") else "low"] for name in relaxation._LIMITS if name != "thrust_min"}
+    assert {name: relaxation._LIMITS[name].unlimited for name in loosest} == loosest
 
 
 def test_a_rotor_margin_above_zero_is_reduced_to_zero_at_most_where_this_suffices():

@@ -1,6 +1,7 @@
 """What the estimate's covariance becomes in nav_msgs/Odometry."""
 
 import numpy as np
+from oracles.unscented import plus
 from perch_core import so3
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.odometry import covariances
@@ -14,7 +15,7 @@ def test_pose_and_twist_spread_as_their_covariances_say():
     A = rng.normal(0.0, 1e-3, (15, 15))
     errors = np.zeros((200_000, at.ERROR_SIZE))
     errors[:, :15] = rng.standard_normal((len(errors), 15)) @ A.T
-    drawn = at.plus(x, errors)
+    drawn = plus(x, errors)
     turn = so3.quat_log(so3.quat_multiply(drawn[:, at.QUATERNION], so3.quat_conjugate(x[at.QUATERNION])))
     v_B = so3.quat_rotate(so3.quat_conjugate(drawn[:, at.QUATERNION]), drawn[:, at.VELOCITY])
     w_B = gyro_noise * rng.standard_normal((len(errors), 3)) - drawn[:, at.GYRO_BIAS]

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_core.values import RotorState
+from perch_perception.ukf.rest import after_rest
 from perch_perception.ukf.stillness import is_at_rest
+from perch_perception.ukf.unscented import Belief
 from perch_perception.ukf import Estimator, ImuSample, UkfConfig, VioOutcome, VioPose
 
 CONFIG, RATE, SIGMA = UkfConfig(), 100.0, (0.03, 0.01)
@@ -56,7 +58,7 @@ class Resting:
 @pytest.mark.parametrize("attitude, minutes", [("wall", 4.0), ("ground", 1.0), ("upside down", 1.0)])
 @pytest.mark.slow
 def test_the_covariance_does_not_grow_and_is_honest(attitude, minutes):
-    """Minutes; what does not grow in four does not grow in sixty (an hour was run once: docs/estimation.md)."""
+    """Minutes; what does not grow in four does not grow in sixty."""
     resting = Resting(attitude=attitude).run(10.0)
     before = resting.sigma
     resting.run(60.0 * minutes - 10.0)
@@ -191,3 +193,19 @@ def test_an_imu_that_comes_back_at_rest_after_a_gap_longer_than_its_history_is_n
     resting = Resting()
     resting.k += round(gap * RATE)
     assert resting.run(1.0).estimator.estimate is not None
+
+
+@pytest.mark.parametrize("measured", [0, 5])
+def test_a_gap_at_rest_measures_no_bias(measured):
+    """The NEES of the gyro's biases, of 200 draws; without samples they only walk."""
+    imu, errors, P = CONFIG.imu, [], np.diag(np.repeat([0.03, 0.002, 0.01, 0.05, 0.2], 3) ** 2)
+    for seed in range(200):
+        bias = np.random.default_rng(seed).normal(0.0, 0.05, 3)
+        rows = steps(bias, UP, n=measured + 1, seed=seed + 1000)
+        rows[0, 0], rows[0, 7:] = 0.4, rows[0, 7:] + [4.0, 25.0]  # as `ImuBuffer` gives a gap
+        found = after_rest(Belief(0, np.r_[np.zeros(9), 1.0, np.zeros(6)], P), rows, 410_000_000, CONFIG)
+        errors.append(bias - found.x[10:13])
+    nees = np.mean([e @ np.linalg.solve(found.P[9:12, 9:12], e) for e in errors])
+    assert 2.46 < nees < 3.59  # chi2, 3 x 200, 99.9 %
+    if not measured:
+        np.testing.assert_allclose(np.diag(found.P)[9:12], 0.05**2 + imu.gyro_bias_walk**2 * 0.4)

@@ -220,12 +220,13 @@ class Mavlink(Component[MavlinkParameters]):
             return b""
 
     def _on_link_lost(self, error: LinkError) -> None:
-        """Close a link that has ended, and reset all state but the autopilot's type and parameters, and who has armed it."""
+        """Close a link that has ended, and reset all state but the autopilot's type, parameters and arming."""
         self.log(LogLine("error", str(error), 1.0))
         self.close()
         before = self.offboard
-        self.offboard = Offboard(before.autopilot, options=before.options, angle_boost=before.angle_boost, arming=before.arming,
-                                 forced=before.forced, commanding=before.commanding, _disarm_until=before._disarm_until)
+        self.offboard = Offboard(before.autopilot, before.armed, options=before.options, angle_boost=before.angle_boost,
+                                 arming=before.arming, forced=before.forced, commanding=before.commanding,
+                                 _disarm_until=before._disarm_until)
         self._clock, self._last_sample = ClockOffset(), None
 
     def _send_command(self, command: int, *words: float) -> None:

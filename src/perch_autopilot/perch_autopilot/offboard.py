@@ -35,7 +35,7 @@ class Offboard:
 
     Attributes:
         autopilot: PX4, ARDUPILOT or another number, from the heartbeat; 0: no heartbeat was received.
-        armed: whether the autopilot is armed.
+        armed: whether the autopilot was armed at its last heartbeat, also where that came by a link that has ended.
         following: whether the autopilot is in the mode in which it follows set points.
         options: ArduPilot's GUID_OPTIONS; 0 until received.
         angle_boost: ArduPilot's ATC_ANGLE_BOOST; None until received.

@@ -15,7 +15,7 @@ from perch_core.vector3 import axes_of, dot
 _POSITION_JUMP = 0.25  # largest step between two samples beyond the motion: above a correction of VIO [m]
 _VELOCITY_JUMP = 1.5   # the same of the velocity, beyond what 4 g change in between [m/s]
 _ATTITUDE_JUMP = 20.0  # the same of the attitude beyond the rotation [deg]
-_CONFIRM = 0.03        # a jump that lasts so long is accepted, if the uncertainty has grown by less than these limits [s]
+_CONFIRM = 0.03        # a jump that lasts so long is accepted, in flight if the uncertainty has grown by less than these limits [s]
 
 
 class Verdict(NamedTuple):
@@ -43,9 +43,10 @@ class OdometryGate:
         Args:
             stamp: [s].
             state: p_WB, v_WB, q_WB (xyzw), w_WB_B, 13 floats.
-            covariances: of pose and twist as in `OdometryState`, shapes (6, 6); None: unknown, a jump that lasts is accepted.
-            flying: whether the vehicle flies: a jump of b3 is not accepted then, however long it lasts. The attitude before it was
-                flown on, and no correction of VIO changes the direction of gravity.
+            covariances: of pose and twist as in `OdometryState`, shapes (6, 6); None: unknown, they prevent no jump.
+            flying: whether the vehicle flies: a jump to an uncertain state, or of b3, is not accepted then, however long it lasts. The
+                attitude before it was flown on, and no correction of VIO changes the direction of gravity. At rest, odometry may
+                begin anew anywhere.
         """
         if self.stamp is None:
             return self._accept(stamp, state, covariances)
@@ -58,7 +59,7 @@ class OdometryGate:
             self._candidate = (stamp, stamp, state)
         self._candidate = (self._candidate[0], stamp, state)
         if stamp - self._candidate[0] >= _CONFIRM:
-            if doubt := self._uncertain_part(covariances) or (self._tilt_change(stamp, state) if flying else ""):
+            if flying and (doubt := self._uncertain_part(covariances) or self._tilt_change(stamp, state)):
                 return Verdict(False, reason=f"{problem}, {doubt}")
             return self._accept(stamp, state, covariances, problem)
         return Verdict(False, reason=problem)

@@ -1,7 +1,7 @@
 """Linear bounds as rows of the reduced program. [M:eq8 in whitened coordinates]
 
 A functional phi of one segment, taken along a direction d, is the row d (x) (L^-1 Z' phi) of w; its value at the
-unconstrained optimum is subtracted from the bounds. Rows have unit length: otherwise solvers can report violated rows as solved.
+unconstrained optimum is subtracted from the bounds. Rows have unit length: the tolerances of `active_set` are lengths.
 """
 
 from __future__ import annotations

@@ -173,13 +173,13 @@ class Search:
                 fitted = None if at_maximum else shortened(durations, self.settings)
                 if fitted is None:
                     return Found(durations, fails, best or Outcome(durations))
-                durations, at_maximum, fails = fitted, True, max(fails, _COARSE_TRIALS - 1)
+                durations, at_maximum, fails = fitted, True, _COARSE_TRIALS - 1
             outcome = self.try_durations(divided_durations(durations, fails), allow_stretch=stretched < _EARLY_STRETCHES)
             if outcome.proved:
                 return Found(durations, fails, outcome)
             if best is None or len(outcome.results):
                 best = outcome
-            if self.fails_early(durations, outcome):
+            if not at_maximum and self.fails_early(durations, outcome):
                 grown, stretched = outcome.stretch * durations, stretched + 1
             elif division_index(fails := fails + 1) < len(FINE_DIVISIONS):
                 grown = durations  # the same, with another division
@@ -221,10 +221,16 @@ class Search:
         return outcome
 
     def _try_divisions(self, durations: np.ndarray | None, first: int) -> Outcome | None:
-        """Return a plan with these durations and any division of the approach; that after `first` failures is tried first."""
-        for fails in (first, *range(_COARSE_TRIALS - 1, _COARSE_TRIALS + len(FINE_DIVISIONS))):
-            if durations is not None and self.iterations < self._iterations_end:
-                tried = self.try_durations(divided_durations(durations, fails))
+        """Return a plan with these durations and any division of the approach; that after `first` failures is tried first.
+
+        Each is tried once: that of `first` is also one of the others, and a short approach has only one.
+        """
+        if durations is None:
+            return None
+        divisions = [divided_durations(durations, fails) for fails in (first, *range(_COARSE_TRIALS - 1, _COARSE_TRIALS + len(FINE_DIVISIONS)))]
+        for divided in {tuple(d.tolist()): d for d in divisions}.values():
+            if self.iterations < self._iterations_end:
+                tried = self.try_durations(divided)
                 if tried.proved:
                     return tried
         return None

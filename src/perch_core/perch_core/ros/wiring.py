@@ -34,7 +34,7 @@ class Publication:
             to_message: value to message, or to a serialised one.
             always: publish also without subscribers: a latched topic keeps its last message for late subscribers.
             on_failure: called with the topic and the exception if a value has no message; the value is dropped.
-            frequent: emitted with every IMU sample; its message may be delayed if a neighbour takes the value.
+            frequent: as `Topic.frequent`; its message may be delayed if a neighbour takes the value.
             observed: no component in flight waits for it.
         """
         self._publisher, self._to_message, self._always, self._on_failure = publisher, to_message, always, on_failure

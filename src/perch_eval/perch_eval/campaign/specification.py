@@ -1,7 +1,7 @@
 """Specification of a campaign: a scenario, distributions of varied quantities, number of runs; a file in `config/campaigns/`.
 
 A varied name is a field of the scenario (`target.distance`, `wind.gust_sigma`), an entry of one of its vectors
-(`wind.steady.0`), or a node's parameter (`parameters.controller.gains.lead`). `seed` can be varied by a grid, too.
+(`wind.steady.0`), or a node's parameter (`parameters.controller.gains.lead`). `seed` can be varied, too, by a grid or a choice.
 """
 
 from __future__ import annotations

@@ -50,7 +50,8 @@ def _table(effort: Effort, vehicle: Vehicle) -> Section:
     out = Section("m_table_1", "[M] Table I: planning time",
                   f"{count} problems with random waypoints for each row (seeds 0 to {count - 1}), first duration 1 s, thrust at most "
                   f"{SETTINGS.thrust_max:g} N, order 14; median [range] over the problems of times on this machine, compilation left out, "
-                  f"the fastest of {REPETITIONS}, but for the nonlinear program. As printed: `perch_planner/paper/paper_m.py`, plain numpy. "
+                  f"the fastest of {REPETITIONS}, but for the nonlinear program. As printed: `perch_planner/paper/paper_m.py`, numpy but for the "
+                  "compiled QP solver and Sturm chains. "
                   "The paper averages 5 runs of OOQP and NLopt on a board of 2018.")
     for waypoints, (paper_qp, paper_nlp) in PAPER.items():
         problems = [waypoint_problem(np.random.default_rng(seed), waypoints) for seed in range(count)]

@@ -1,8 +1,7 @@
 """The UKF's inner loops in scalar form: one IMU step of the mean, and sigma points through a run of IMU steps.
 
 The code is scalar because numba then needs about 0.1 us per IMU step and sigma point, whereas numpy needs 10 us per
-operation on three numbers. `unscented.py` holds the vectorised form, which is used without numba and in tests.
-Indices follow `layout.py`.
+operation on three numbers. Indices follow `layout.py`.
 """
 
 from __future__ import annotations
@@ -13,8 +12,7 @@ import numpy as np
 
 from perch_core.jit import compiled
 from perch_core.vector3 import quaternion_product
-
-_GRAVITY = 9.81  # numba freezes globals: equal to perch_core.vehicle.GRAVITY, which a test asserts
+from perch_core.vehicle import GRAVITY
 
 
 @compiled
@@ -53,7 +51,7 @@ def advance(x, w0, w1, w2, a0, a1, a2, dt):
     t2 = 2.0 * (m0 * a1 - m1 * a0)
     f0 = a0 + m3 * t0 + m1 * t2 - m2 * t1
     f1 = a1 + m3 * t1 + m2 * t0 - m0 * t2
-    f2 = a2 + m3 * t2 + m0 * t1 - m1 * t0 - _GRAVITY
+    f2 = a2 + m3 * t2 + m0 * t1 - m1 * t0 - GRAVITY
     x[0] += (x[3] + h * f0) * dt
     x[1] += (x[4] + h * f1) * dt
     x[2] += (x[5] + h * f2) * dt

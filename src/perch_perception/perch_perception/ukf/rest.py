@@ -15,6 +15,7 @@ from perch_core import so3
 from perch_core.vehicle import GRAVITY
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
+from perch_perception.ukf.imu_buffer import without_gaps
 from perch_perception.ukf.stillness import REST_VELOCITY
 from perch_perception.ukf.unscented import ACCEL, DT, GATES, GYRO, Belief, Innovation, UnscentedTransform
 
@@ -28,21 +29,26 @@ def after_stop(belief: Belief) -> Belief | None:
 
 
 def after_rest(belief: Belief, steps: np.ndarray, stamp: int, config: UkfConfig) -> Belief:
-    """Return the belief of a vehicle at rest over IMU steps (m, 9), m > 0, at their end `stamp` [ns]."""
+    """Return the belief of a vehicle at rest over IMU steps (m, 9), m > 0, at their end `stamp` [ns].
+
+    Over a gap in the samples it rests unmeasured: only the biases walk.
+    """
     imu, x, P = config.imu, belief.x.copy(), belief.P.copy()
-    T, d = float(steps[:, DT].sum()), np.arange(3)
+    T, steps, d = float(steps[:, DT].sum()), without_gaps(steps), np.arange(3)
     x[at.VELOCITY] = 0.0
     P[at.D_VELOCITY, :] = P[:, at.D_VELOCITY] = 0.0
     P[at.D_VELOCITY, at.D_VELOCITY] = REST_VELOCITY**2 * np.eye(3)  # how it trembles now says nothing of then
     P[9 + d, 9 + d] += imu.gyro_bias_walk**2 * T
     P[12 + d, 12 + d] += imu.accel_bias_walk**2 * T
+    resting = Belief(stamp, x, P)
+    if not len(steps):
+        return resting
     up_B = so3.quat_rotate(so3.quat_conjugate(x[at.QUATERNION]), np.array([0.0, 0.0, GRAVITY]))
     H = np.zeros((6, at.ERROR_SIZE))
     H[:3, at.D_GYRO_BIAS] = H[3:, at.D_ACCEL_BIAS] = np.eye(3)
     H[3:, at.D_ATTITUDE] = so3.hat(up_B)
     residual = np.concatenate([steps[:, GYRO].mean(axis=0) - x[at.GYRO_BIAS], steps[:, ACCEL].mean(axis=0) - x[at.ACCEL_BIAS] - up_B])
-    resting = Belief(stamp, x, P)
-    variance = np.repeat([imu.gyro_noise_density**2, imu.accel_noise_density**2], 3) / T
+    variance = np.repeat([imu.gyro_noise_density**2, imu.accel_noise_density**2], 3) / float(steps[:, DT].sum())
     return UnscentedTransform.correct(resting, _innovation(resting, H, residual, variance))
 
 

@@ -1,7 +1,6 @@
 """The unscented transforms of the UKF: prediction through IMU steps and the update with a pose.
 
-Sigma points and weights are the scaled ones of van der Merwe on the error vector; `layout.plus`/`minus` map the points to
-the manifold and back. The prediction uses `kernels.unscented_run` or, without numba, the vectorised form here. The update is
+Sigma points and weights are the scaled ones of van der Merwe on the error vector. The prediction is in `kernels`, the update
 in `update_kernels`. The equations are in docs/estimation.md, section UKF.
 """
 
@@ -10,13 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky
 
-from perch_core import so3
 from perch_core.errors import PerchError
-from perch_core.jit import COMPILED
 from perch_core.probability import chi2_quantile
-from perch_core.vehicle import GRAVITY
 from perch_perception.ukf import kernels, update_kernels
 from perch_perception.ukf import layout as at
 from perch_perception.ukf.config import UkfConfig
@@ -92,35 +87,12 @@ class UnscentedTransform:
         """
         if len(run) == 0:
             return Belief(stamp, belief.x, belief.P)
-        if COMPILED:
-            x, P = np.empty(at.NOMINAL_SIZE), np.empty((at.ERROR_SIZE, at.ERROR_SIZE))
-            Wm, Wc = self.Wm, self.Wc
-            if not kernels.unscented_run(belief.x, belief.P, run, self.scale, Wm[0], Wc[0], Wm[1], x, P):
-                raise CovarianceError(f"covariance at {belief.stamp} ns is not positive definite")
-        else:
-            x, P = self.predict_vectorised(belief.x, belief.P, run)
-        imu = self.config.imu
+        x, P = np.empty(at.NOMINAL_SIZE), np.empty((at.ERROR_SIZE, at.ERROR_SIZE))
+        imu, Wm, Wc = self.config.imu, self.Wm, self.Wc
+        if not kernels.unscented_run(belief.x, belief.P, run, self.scale, Wm[0], Wc[0], Wm[1], x, P):
+            raise CovarianceError(f"covariance at {belief.stamp} ns is not positive definite")
         update_kernels.add_process_noise(run, imu.gyro_bias_walk**2, imu.accel_bias_walk**2, P)
         return Belief(stamp, x, P)
-
-    def predict_vectorised(self, x: np.ndarray, P: np.ndarray, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the same transform in numpy for all sigma points at once: used without numba and to test the kernel."""
-        points = at.plus(x, self._sigma_points(P))
-        gravity = np.array([0.0, 0.0, GRAVITY])
-        p, v, q = points[:, at.POSITION], points[:, at.VELOCITY], points[:, at.QUATERNION]
-        for row in run:
-            dt = row[DT]
-            half = so3.quat_exp((row[GYRO] - points[:, at.GYRO_BIAS]) * (0.5 * dt))
-            middle = so3.quat_multiply(q, half)
-            a_W = so3.quat_rotate(middle, row[ACCEL] - points[:, at.ACCEL_BIAS]) - gravity
-            p = p + (v + 0.5 * dt * a_W) * dt
-            v = v + a_W * dt
-            q = so3.quat_multiply(middle, half)
-        points[:, at.POSITION], points[:, at.VELOCITY], points[:, at.QUATERNION] = p, v, q
-        deviations = at.minus(points, points[0])
-        mean = self.Wm @ deviations
-        centred = deviations - mean
-        return at.plus(points[0], mean), (centred * self.Wc[:, None]).T @ centred
 
     def innovate(self, belief: Belief, pose: VioPose, R: np.ndarray) -> Innovation:
         """Return innovation and gain for a pose and, where measured, a velocity at the belief's time.
@@ -155,10 +127,3 @@ class UnscentedTransform:
         x, P = np.empty(at.NOMINAL_SIZE), np.empty((at.ERROR_SIZE, at.ERROR_SIZE))
         update_kernels.correct(belief.x, belief.P, innovation.gain, innovation.S, innovation.residual, x, P)
         return Belief(belief.stamp, x, P)
-
-    def _sigma_points(self, P: np.ndarray) -> np.ndarray:
-        try:
-            root = cholesky(self.scale * P)
-        except np.linalg.LinAlgError:
-            raise CovarianceError("covariance is not positive definite") from None
-        return np.vstack([np.zeros(at.ERROR_SIZE), root, -root])

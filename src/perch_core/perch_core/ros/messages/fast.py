@@ -1,4 +1,4 @@
-"""Serialisation of the topics of 100 Hz and more, without rclpy's objects: in a tenth of the time."""
+"""Serialisation of the frequent topics, without rclpy's objects: in a tenth of the time."""
 
 from __future__ import annotations
 
