@@ -345,6 +345,13 @@ def test_durations_of_duration_max_are_tried_with_all_divisions_of_the_approach(
     assert len(last) == len(set(last)) == 1 + len(FINE_DIVISIONS)
 
 
+@pytest.mark.parametrize("seed, duration_max", [(700006, 5.76), (700007, 3.56), (700020, 2.8), (700067, 2.58)])
+def test_at_duration_max_peaks_are_cut_that_longer_durations_would_reduce(seed, duration_max):
+    """Peaks before the last waypoint, or beyond 1.7 times the limit."""
+    settings = replace(shipped_settings(), duration_max=duration_max)
+    assert checked(random_problem(np.random.default_rng(seed)), settings).duration == pytest.approx(duration_max)
+
+
 def test_a_duration_max_without_room_for_the_tube_is_refused():
     with pytest.raises(PerchRefusal) as caught:
         plan(PerchProblem(HOVER, surface(90.0)), PerchSettings(duration_max=0.2), VEHICLE)

@@ -164,7 +164,7 @@ class Search:
 
         Where the thrust leaves its range before the last waypoint, all segments grow; otherwise mainly the approach, from the
         third try on only after all its divisions failed. Longer durations are shortened to `duration_max` once, and tried with
-        all divisions.
+        all divisions, none of which ends early at a peak: nothing longer follows.
         """
         best, stretched, fails, at_maximum = None, 0, 0, False
         while True:
@@ -174,7 +174,8 @@ class Search:
                 if fitted is None:
                     return Found(durations, fails, best or Outcome(durations))
                 durations, at_maximum, fails = fitted, True, _COARSE_TRIALS - 1
-            outcome = self.try_durations(divided_durations(durations, fails), allow_stretch=stretched < _EARLY_STRETCHES)
+            allow_stretch = not at_maximum and stretched < _EARLY_STRETCHES
+            outcome = self.try_durations(divided_durations(durations, fails), allow_stretch)
             if outcome.proved:
                 return Found(durations, fails, outcome)
             if best is None or len(outcome.results):
