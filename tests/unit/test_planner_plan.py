@@ -345,6 +345,14 @@ def test_durations_of_duration_max_are_tried_with_all_divisions_of_the_approach(
     assert len(last) == len(set(last)) == 1 + len(FINE_DIVISIONS)
 
 
+def test_durations_whose_approach_is_short_are_tried_once(monkeypatch):
+    """A short approach is not divided: the next division would repeat the programs of the last one."""
+    searched, tried = search.Search(PerchProblem(HOVER, surface(90.0)), PerchSettings(duration_max=0.8), VEHICLE, Limits.of(PerchSettings(), VEHICLE)), []
+    monkeypatch.setattr(searched, "try_durations", lambda durations, allow_stretch: tried.append(tuple(durations)) or search.Outcome(durations))
+    searched._run_from(np.array([0.5]))
+    assert len(tried) == len(set(tried)) > 1
+
+
 @pytest.mark.parametrize("seed, duration_max", [(700006, 5.76), (700007, 3.56), (700020, 2.8), (700067, 2.58)])
 def test_at_duration_max_peaks_are_cut_that_longer_durations_would_reduce(seed, duration_max):
     """Peaks before the last waypoint, or beyond 1.7 times the limit."""

@@ -166,7 +166,7 @@ class Search:
         third try on only after all its divisions failed. Longer durations are shortened to `duration_max` once, and tried with
         all divisions, none of which ends early at a peak: nothing longer follows.
         """
-        best, stretched, fails, at_maximum = None, 0, 0, False
+        best, stretched, fails, at_maximum, outcome = None, 0, 0, False, Outcome(np.empty(0))
         while True:
             if durations.sum() > self.settings.duration_max:
                 self.active_limits.add("duration_max")
@@ -175,7 +175,9 @@ class Search:
                     return Found(durations, fails, best or Outcome(durations))
                 durations, at_maximum, fails = fitted, True, _COARSE_TRIALS - 1
             allow_stretch = not at_maximum and stretched < _EARLY_STRETCHES
-            outcome = self.try_durations(divided_durations(durations, fails), allow_stretch)
+            divided = divided_durations(durations, fails)
+            if not np.array_equal(divided, outcome.durations):  # a short approach has only one division
+                outcome = self.try_durations(divided, allow_stretch)
             if outcome.proved:
                 return Found(durations, fails, outcome)
             if best is None or len(outcome.results):
