@@ -27,17 +27,22 @@ _CAMERA = np.r_[THETA, POSITION, CAMERA_ROTATION, CAMERA_POSITION]  # what a poi
 
 
 @compiled
-def _transformed_covariance(P, direction, scale):
-    """Return M P M^T with M = I + direction scale^T, both vectors of shape (n,)."""
-    n = len(P)
+def _symmetrise(P):
+    """Replace P by (P + P^T) / 2."""
+    for r in range(len(P)):
+        for c in range(r):
+            P[r, c] = P[c, r] = 0.5 * (P[r, c] + P[c, r])
+
+
+@compiled
+def _transform_covariance(P, direction, scale):
+    """Replace P by M P M^T with M = I + direction scale^T, both vectors of shape (n,)."""
     q = P @ scale
     variance = scale @ q
-    out = np.empty((n, n))
-    for r in range(n):
+    for r in range(len(P)):
         for c in range(r + 1):
-            out[r, c] = P[r, c] + direction[r] * q[c] + q[r] * direction[c] + variance * direction[r] * direction[c]
-            out[c, r] = out[r, c]
-    return out
+            P[r, c] = P[r, c] + direction[r] * q[c] + q[r] * direction[c] + variance * direction[r] * direction[c]
+            P[c, r] = P[r, c]
 
 
 @dataclass
@@ -106,19 +111,21 @@ class State:
         """
         direction = self.scale_direction()
         transport = self._move(dx)
-        P = transport(np.ascontiguousarray(transport(self.P).T))
-        self.P = 0.5 * (P + P.T)
+        transport(self.P)
+        transport(self.P.T)
+        _symmetrise(self.P)
         scale = self.scale_error()
         if scale is not None:
-            transported = transport(direction[:, None])[:, 0]
-            self.P = _transformed_covariance(self.P, self.scale_direction() - transported, scale / (scale @ transported))
+            transport(direction[:, None])
+            _transform_covariance(self.P, self.scale_direction() - direction, scale / (scale @ direction))
 
-    def _move(self, dx: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """Move all estimates; return the function that transforms errors accordingly, rows (size, n) to rows."""
+    def _move(self, dx: np.ndarray) -> Callable[[np.ndarray], None]:
+        """Move all estimates; return the function that transforms errors accordingly, in place, in an array of shape (size, n)."""
         start, marks = self.landmark_start, list(self.landmarks.values())
         where = np.array([0, *map(self.clone_at, range(len(self.clones)))])[:, None] + np.arange(CLONE_SIZE)
         R, steps = np.array([self.R_WB, *(c.R_WB for c in self.clones)]), dx[where]
-        E, E_BC = so3.exp(steps[:, :3]), so3.exp(dx[CAMERA_ROTATION])
+        turns = so3.exp(np.vstack([steps[:, :3], dx[CAMERA_ROTATION]]))
+        E, E_BC = turns[:-1], turns[-1]
         poses = np.zeros((len(where), CLONE_SIZE, CLONE_SIZE))
         poses[:, :3, :3], poses[:, 3:, 3:], poses[:, 3:, :3] = E.transpose(0, 2, 1), np.eye(3), -so3.hat(steps[:, 3:]) @ R
         velocity = so3.hat(dx[VELOCITY]) @ self.R_WB
@@ -140,14 +147,12 @@ class State:
             mark.X_W = X
         by_camera, by_moved, by_point = camera_frame.error_transport(before, self._to_camera(X_W), S)
 
-        def transport(rows: np.ndarray) -> np.ndarray:
-            out = rows.copy()
-            out[where] = poses @ rows[where]
-            out[VELOCITY] -= velocity @ rows[THETA]
-            out[CAMERA_ROTATION] = E_BC.T @ rows[CAMERA_ROTATION]
-            points = by_point @ rows[start:].reshape(len(marks), 3, rows.shape[1])
-            out[start:] = by_camera @ rows[_CAMERA] - by_moved @ out[_CAMERA] + points.reshape(3 * len(marks), rows.shape[1])
-            return out
+        def transport(rows: np.ndarray) -> None:
+            camera, points = rows[_CAMERA], rows[start:].reshape(len(marks), 3, rows.shape[1])
+            rows[VELOCITY] -= velocity @ camera[:3]
+            rows[where] = poses @ rows[where]
+            rows[CAMERA_ROTATION] = E_BC.T @ camera[6:9]
+            rows[start:] = by_camera @ camera - by_moved @ rows[_CAMERA] + (by_point @ points).reshape(-1, rows.shape[1])
 
         return transport
 
@@ -178,8 +183,9 @@ class State:
         out = np.zeros(self.size)
         out[POSITION] = self.p_WB + self.R_WB @ self.p_BC
         out[VELOCITY] = self.v_WB + self.R_WB @ so3.cross(self.w_WB_B, self.p_BC)
-        for pose, clone in zip(out[CORE_SIZE : self.landmark_start].reshape(-1, CLONE_SIZE), self.clones):
-            pose[3:] = clone.p_WB + clone.R_WB @ self.p_BC
+        if self.clones:
+            R, p = self.window()
+            out[CORE_SIZE : self.landmark_start].reshape(-1, CLONE_SIZE)[:, 3:] = p + R @ self.p_BC
         if self.landmarks:
             out[self.landmark_start :] = np.concatenate([m.X_W for m in self.landmarks.values()])
         return out
