@@ -130,3 +130,15 @@ def test_the_page_has_the_claim_on_the_mean_and_the_share_of_single_samples(tmp_
     assert (tmp_path / "consistency.png").exists()
     monkeypatch.setattr(part, "cached_figures", lambda *arguments, **options: [])
     assert part.consistency_sections(effort)[0].rows[0].verdict == "not available"
+
+
+def test_parts_without_a_time_at_which_half_of_the_flights_have_a_sample_are_reported_as_missing(tmp_path, monkeypatch):
+    def flown(effort, name, seeds, *arguments, **options):
+        metrics = dict.fromkeys((*part.RMSE, *part.NIS), 1.0)
+        return [{"number": seed, "seed": seed, "cause": "perched", "outcome": "perched", "message": "", "metrics": metrics, "history": {
+            name: [1.0 if k % 3 == seed else None for k in range(len(part.TIMES))] for name in part.DIMENSIONS}} for seed in range(3)]
+
+    monkeypatch.setattr(part, "cached_figures", flown)
+    [section] = part.consistency_sections(Effort(False, 1, tmp_path, tmp_path, "", range(3), range(1), 1, {"commit": "1234567", "digest": ""}))
+    assert [row.verdict for row in section.rows if row.name in part.DIMENSIONS] == ["not available"] * len(part.DIMENSIONS)
+    assert not section.figures

@@ -24,12 +24,12 @@ def test_whitened_observations_of_walking_points_are_white():
     q = (CONFIG.filter.slide_turn / FOCAL) ** 2 * np.arccos(np.clip((b[1:] * b[:-1]).sum(axis=1), -1, 1))
     q += (CONFIG.filter.slide_zoom / FOCAL) ** 2 * np.log(d[1:] / d[:-1])
     steps = rng.normal(size=(20000, len(q))) * np.sqrt(q)
-    # the point is where it is seen last: earlier observations are off by what it has walked since
-    walk = -np.concatenate([np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros((20000, 1))], axis=1)
+    # the point is where it is seen last: earlier observations are off by what it has walked in the scene since, as seen from where they were
+    walk = -np.concatenate([np.cumsum((steps * d[1:])[:, ::-1], axis=1)[:, ::-1], np.zeros((20000, 1))], axis=1) / d
     noise = np.linspace(1.0, 3.0, len(b))
     seen = walk + rng.normal(size=walk.shape) * noise * CONFIG.calibration.track / FOCAL
     sliding = TrackWalk(CONFIG, FOCAL)
-    white = sliding.whitened(sliding.steps(b[:-1], b[1:], d[:-1], d[1:]), seen.T, noise) / (CONFIG.calibration.track / FOCAL)
+    white = sliding.whitened(sliding.steps(b[:-1], b[1:], d[:-1], d[1:]), d, seen.T, noise) / (CONFIG.calibration.track / FOCAL)
     assert np.cov(white) == pytest.approx(np.eye(len(b)), abs=0.06)
 
 
@@ -38,7 +38,7 @@ def test_a_view_that_stands_still_makes_nothing_walk():
     sliding = TrackWalk(CONFIG, FOCAL)
     assert sliding.steps(b, b, d, d) == pytest.approx(np.zeros(len(b)), abs=1e-12)
     rows = np.random.default_rng(2).normal(size=(4, 3))
-    assert sliding.whitened(np.zeros(3), rows) == pytest.approx(rows)
+    assert sliding.whitened(np.zeros(3), d[:4], rows) == pytest.approx(rows)
 
 
 def test_points_walk_across_the_line_of_sight_only():

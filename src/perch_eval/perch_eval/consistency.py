@@ -89,7 +89,7 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int) -> 
     low, high = np.array([chi2_quantile(PROBABILITIES, n * dimension) / n for n in (1, *counts.tolist())]).reshape(-1, 2).T
     single = samples[np.isfinite(samples)]
     return Consistency(name, dimension, np.asarray(times)[used], np.nanmean(samples, axis=0), np.stack([low[1:], high[1:]]), len(samples),
-                       float(np.mean((single >= low[0]) & (single <= high[0]))))
+                       float(np.mean((single >= low[0]) & (single <= high[0]))) if len(single) else np.nan)
 
 
 def plot(results: list[Consistency], path: Path, marks: dict[str, float]) -> None:

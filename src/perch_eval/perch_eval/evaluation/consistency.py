@@ -77,6 +77,9 @@ def consistency_sections(effort: Effort) -> list[Section]:
         return [out]
     results = [consistency.judge(name, TIMES, np.array([judged[name] for _, judged in flown], float), dimension)
                for name, dimension in DIMENSIONS.items()]
+    for name in (r.name for r in results if not len(r.times)):
+        out.missing(name, "", "at no time do half of the flights have a sample")
+    results = [r for r in results if len(r.times)]
     for r in results:
         words = f"{r.mean.mean() / r.dimension:.2f}; {100 * r.inside:.0f} % inside, {100 * r.above:.0f} % above"
         if r.name == STATES:
@@ -92,8 +95,9 @@ def consistency_sections(effort: Effort) -> list[Section]:
     out.show("RMSE of x, y, z through the perch", f"{rmse} cm", note="median")
     for name, title in NIS.items():
         out.show(f"NIS of {title} over its dimension", f"{np.nanmean(metrics[name]):.2f}", note="mean over the flights")
-    consistency.plot(results, effort.out / "consistency.png", {"perch": 0.0})
-    out.figures.append(("consistency.png", "NEES, mean over the runs, with its expectation and its 95 % bounds"))
+    if results:
+        consistency.plot(results, effort.out / "consistency.png", {"perch": 0.0})
+        out.figures.append(("consistency.png", "NEES, mean over the runs, with its expectation and its 95 % bounds"))
     return [out]
 
 

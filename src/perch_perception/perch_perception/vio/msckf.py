@@ -274,7 +274,7 @@ class Msckf:
             A[:, :, :n] = now.J[rows, :, :n]
             A[:, :, n:-4].reshape(m, 2, -1, 6)[np.arange(m), :, js[rows]] = now.J[rows, :, n : POINT.start]
             A[:, :, -4:-1], A[:, :, -1] = now.J[rows, :, POINT], now.r[rows]
-            white = self.track_walk.whitened(walk[rows.start : rows.stop - 1], A.reshape(m, -1), noise[rows]).reshape(2 * m, -1)
+            white = self.track_walk.whitened(walk[rows.start : rows.stop - 1], now.distance[rows], A.reshape(m, -1), noise[rows]).reshape(2 * m, -1)
             out[number] = X_W, white[:, :-4], white[:, -4:-1], white[:, -1]
         return out
 

@@ -6,8 +6,9 @@ direction,
 
     q = slide_turn^2 |d beta| + slide_zoom^2 |d ln distance|,
 
-with beta the direction in which the camera sees the point. A landmark performs this walk in the scene. A track's observations get
-the covariance sigma^2 I + walk, accumulated backwards from the last one, whose point is the one solved for.
+with beta the direction in which the camera sees the point. A point performs this walk in the scene: a step at the distance d' is
+d'/d times as large an angle from the distance d. A track's observations get the covariance sigma^2 I + walk, accumulated backwards
+from the last one, whose point is the one solved for.
 """
 
 from __future__ import annotations
@@ -50,17 +51,18 @@ class TrackWalk:
         q = self.steps(b_before, b_now, d_before, d_now) * d_now**2
         return q[:, None, None] * (np.eye(3) - u[:, :, None] * u[:, None, :])
 
-    def whitened(self, steps: np.ndarray, rows: np.ndarray, noise: np.ndarray | float = 1.0) -> np.ndarray:
+    def whitened(self, steps: np.ndarray, distance: np.ndarray, rows: np.ndarray, noise: np.ndarray | float = 1.0) -> np.ndarray:
         """Transform the rows of one track's observations so that their noise is white with the variance sigma^2.
 
         Args:
             steps: variance of the walk between neighbouring observations, see `steps` [rad^2], shape (m - 1,).
+            distance: from the camera to the point at each observation [m], shape (m,).
             rows: one row for each observation, shape (m, k).
             noise: white noise of each observation, ratio of its 1 sigma to the camera's, shape (m,).
         """
         to_end = np.zeros(len(rows))
-        to_end[-2::-1] = np.cumsum(steps[::-1] / self._sigma**2)
-        covariance = np.minimum(to_end[:, None], to_end)
+        to_end[-2::-1] = np.cumsum((steps * distance[1:] ** 2)[::-1])
+        covariance = np.minimum(to_end[:, None], to_end) / (self._sigma**2 * distance[:, None] * distance)
         covariance.flat[:: len(rows) + 1] += noise**2
         factor, _ = lapack.dpotrf(covariance, lower=1, clean=0)
         return lapack.dtrtrs(factor, rows, lower=1)[0]

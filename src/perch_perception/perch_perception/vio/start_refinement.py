@@ -253,7 +253,8 @@ def _linearised(s: _Unknowns, steps: Sequence[np.ndarray], sights: Sequence[Poin
     walk = track_walk.steps(seen.b_C[:-1], seen.b_C[1:], now.distance[:-1], now.distance[1:])
     rows, rests, points, ends = [], [], [], np.cumsum(count)
     for begin, end in zip(ends - count, ends):
-        white = track_walk.whitened(walk[begin : end - 1], A[begin:end].reshape(end - begin, -1)).reshape(2 * (end - begin), -1)
+        white = track_walk.whitened(walk[begin : end - 1], now.distance[begin:end], A[begin:end].reshape(end - begin, -1))
+        white = white.reshape(2 * (end - begin), -1)
         R_f, H_1, r_1, H_0, r_0 = ekf.eliminate(white[:, 3:-1], white[:, :3], white[:, -1])
         rows.append(H_0)
         rests.append(r_0)
