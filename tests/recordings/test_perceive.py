@@ -122,6 +122,12 @@ def test_the_truth_of_a_recording_of_perch_is_found(tmp_path):
     assert BagRecording(tmp_path / "flight.mcap", None).truth_topic == "/ground_truth/odometry"
 
 
+def test_a_bag_without_images_and_imu_is_refused(tmp_path):
+    record(tmp_path / "flight.mcap", {"ground_truth/odometry": flown()["ground_truth/odometry"]})
+    with pytest.raises(RecordingError, match="neither images nor samples of an IMU .*; its topics: .*ground_truth/odometry"):
+        BagRecording(tmp_path / "flight.mcap", None)
+
+
 def test_topics_that_the_recording_lacks_are_those_of_the_nodes(files):
     """A calibration names those of its own recording; drivers are remapped for the nodes."""
     available = {"/imu/data_raw", "/quad1/camera_down/image_raw/compressed", "/imu0"}

@@ -150,6 +150,22 @@ def test_calibrations_that_are_none_are_refused(tmp_path, old, new, words):
         from_kalibr(chain, None, "mine")
 
 
+@pytest.mark.parametrize("name, entry, diagonal", [  # as Kalibr and OpenVINS write them
+    ("gyroscopes.M", "gyroscopes:\n  M: {0}", 1.0), ("gyroscopes.A", "gyroscopes:\n  A: {0}", 0.0),
+    ("gyroscopes.C_gyro_i", "gyroscopes:\n  C_gyro_i: {0}", 1.0), ("accelerometers.M", "accelerometers:\n  M: {0}", 1.0),
+    ("Tw", "Tw: {0}", 1.0), ("Ta", "Ta: {0}", 1.0), ("Tg", "Tg: {0}", 0.0), ("R_IMUtoGYRO", "R_IMUtoGYRO: {0}", 1.0)])
+def test_an_imu_whose_samples_need_a_correction_is_refused(tmp_path, name, entry, diagonal):
+    chain, imu = photo_flight.kalibr(tmp_path)
+    plain, matrix = imu.read_text(), diagonal * np.eye(3)
+    imu.write_text(plain + entry.format(matrix.tolist()) + "\n")
+    assert from_kalibr(chain, imu, "mine").imu is not None
+    matrix[1, 0] = 0.012
+    for value in (matrix.tolist(), "[[1.0, 0.0]]"):
+        imu.write_text(plain + entry.format(value) + "\n")
+        with pytest.raises(ConfigError, match=f"{name}: .* is not .*sensor files have no scale"):
+            from_kalibr(chain, imu, "mine")
+
+
 def test_components_take_everything_from_the_file(files):
     name, sensors = str(files / "mine.yaml"), load_sensors(files / "mine.yaml")
     vio = VioComponent(VioComponentConfig(sensors=name, camera="cam0"))

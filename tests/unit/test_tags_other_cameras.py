@@ -114,6 +114,17 @@ def test_a_grid_whose_tags_touch_black_squares(distance, least):
     assert len(result.board.ids) >= least and position < 0.003 and np.degrees(attitude) < 0.3
 
 
+@pytest.mark.parametrize(("distance", "least"), [(0.6, 10), (0.9, 30)])
+def test_a_grid_that_is_tracked_keeps_its_small_tags(distance, least):
+    board = TagBoard((0.75, 0.75), border=2, corner_squares=True, grid=TagGrid(6, 6, 0.088, 0.3, rotation=180.0))
+    p, R = np.array([0.02, 0.03, distance]), turned(20.0, -12.0, 0.0)
+    image, localizer = photographed([(board, p, R)], np.random.default_rng(3)), BoardLocalizer(board, MOUNT)
+    localizer.process(image, 0.0)
+    tracked = localizer.process(image, 0.05).board
+    position, attitude = errors(tracked, p, R)
+    assert len(tracked.ids) >= least and position < 0.003 and np.degrees(attitude) < 0.3
+
+
 @pytest.mark.parametrize("blur", [0.6, 1.5, 2.0, 2.5])
 def test_large_tags_of_a_blurred_grid_are_not_found_at_the_inner_outline_of_their_borders(blur):
     """Tags 170 px wide whose corner squares merge with them: corners found to 3 px, and all measured to 0.5 px."""

@@ -18,6 +18,9 @@ from perch_core.yaml_text import parse_yaml
 MODELS = {"radtan": "radtan", "radial-tangential": "radtan", "plumb_bob": "radtan", "equidistant": "equidistant",
           "none": "pinhole", "": "pinhole"}
 ROTATION_TOLERANCE = 1e-3  # of a rotation matrix in a file
+UNMODELLED = {"gyroscopes.M": 1.0, "gyroscopes.C_gyro_i": 1.0, "gyroscopes.A": 0.0, "accelerometers.M": 1.0,
+              "Tw": 1.0, "R_IMUtoGYRO": 1.0, "Tg": 0.0, "Ta": 1.0, "R_IMUtoACC": 1.0}
+"""Scale, misalignment and g-sensitivity of an IMU, as Kalibr and OpenVINS name them: multiple of the identity of one that has none."""
 IMU_KEYS = {"accel_noise_density": "accelerometer_noise_density", "gyro_noise_density": "gyroscope_noise_density",
             "accel_bias_walk": "accelerometer_random_walk", "gyro_bias_walk": "gyroscope_random_walk"}
 
@@ -130,9 +133,29 @@ def _camera(source: str, dot: str, c: dict[str, Any], distortion: Any, T_IC: np.
 def _imu(source: str, c: Any, R_BI: np.ndarray) -> dict[str, Any]:
     if not isinstance(c, dict):
         raise ConfigError(source, "", "is no mapping")
+    _check_unmodelled(source, c)
     out: dict[str, Any] = {ours: _number(source, theirs, _required(source, c, theirs)) for ours, theirs in IMU_KEYS.items()}
     return out | {"rate": _number(source, "update_rate", c.get("update_rate", c.get("rate_hz"))),
                   "orientation": so3.quat_from_matrix(R_BI).tolist(), "topic": str(c.get("rostopic", ""))}
+
+
+def _check_unmodelled(source: str, c: dict[str, Any]) -> None:
+    """Refuse an IMU whose samples have to be corrected by a matrix: sensor files have none.
+
+    Raises:
+        ConfigError: a matrix of `UNMODELLED` is not that of an IMU without such errors.
+    """
+    for name, factor in UNMODELLED.items():
+        value: Any = c
+        for key in name.split("."):
+            value = value.get(key) if isinstance(value, dict) else None
+        try:
+            none = value is None or np.allclose(np.array(value, float), factor * np.eye(3), atol=1e-6)
+        except (TypeError, ValueError):
+            none = False
+        if not none:
+            raise ConfigError(source, name, f"{value} is not {'the identity' if factor else 'zero'}: sensor files have no scale, misalignment or "
+                              "g-sensitivity of the IMU; calibrate with --imu-models calibrated, or correct the samples")
 
 
 def _mapping(path: Path) -> dict[str, Any]:

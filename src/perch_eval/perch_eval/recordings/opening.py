@@ -82,6 +82,9 @@ class BagRecording(Recording):
         if sensors is None:
             self._cameras = {_camera_name(topic): topic for topic in sorted(pictures)}
             self._imu = imus[0] if imus else ""
+            if not pictures and not imus:
+                raise RecordingError(f"{path}: has neither images nor samples of an IMU (sensor_msgs: Image, CompressedImage, Imu); its topics: "
+                                     f"{', '.join(sorted(kinds)) or 'none'}")
         else:
             found = {name: _topic((camera.topic, f"camera_{name}/image_raw"), pictures) for name, camera in sensors.cameras.items()}
             self._cameras = {name: topic for name, topic in found.items() if topic}

@@ -7,6 +7,7 @@ the tags' numbers again, the expected corners are accurate enough to measure the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -22,7 +23,7 @@ from perch_perception.tags.consensus import consistent
 from perch_perception.tags.detector import VIEW_TAG_SIDE, Detection, TagDetector
 from perch_perception.tags.pose import BoardPose, LocalizationRefusal, solve_board
 from perch_perception.tags.refinement import refine_corners
-from perch_perception.tags.view import VirtualView
+from perch_perception.tags.view import GRID, MAX_SIDE, VirtualView
 
 SEARCH_PERIOD = 0.1  # between searches of the whole frame, 10 ms each [s]
 LOST_AFTER = 0.4   # tracking without a tag before searching [s]
@@ -88,6 +89,9 @@ class BoardLocalizer:
         self._detector = TagDetector(board, mount.camera)
         self._tag_size = float(np.median(np.linalg.norm(board.corners_S[:, 0] - board.corners_S[:, 1], axis=-1)))
         self._radius = float(np.linalg.norm(board.corners_S, axis=-1).max())
+        # Side [px] of a view in which tags have the wanted size while the board is seen under a half angle of at most 45 deg.
+        side = 2.0 * VIEW_MARGIN * VIEW_TAG_SIDE * self._radius / self._tag_size / math.cos(math.radians(45.0))
+        self._max_side = max(MAX_SIDE, GRID * math.ceil(side / GRID))
         self._last: BoardPose | None = None       # last sighting ...
         self._last_body: BodyState | None = None  # ... where the vehicle was then ...
         self._last_time = -np.inf                 # ... and when
@@ -190,7 +194,7 @@ class BoardLocalizer:
         """Return the view of the board's expected surroundings, `radius` [m] around p_CS."""
         distance = float(np.linalg.norm(p_CS))
         share = min(VIEW_MARGIN * radius / max(distance, 1e-3), 0.95)
-        return VirtualView.aim(p_CS, float(np.arcsin(share)), VIEW_TAG_SIDE * distance / self._tag_size)
+        return VirtualView.aim(p_CS, float(np.arcsin(share)), VIEW_TAG_SIDE * distance / self._tag_size, self._max_side)
 
     def _predict(self, last: BoardPose, body: BodyState | None) -> tuple[np.ndarray, np.ndarray]:
         """Predict the board's pose, p_CS and R_CS: the board is fixed in the map while the vehicle moves."""

@@ -16,7 +16,7 @@ from perch_core import so3
 from perch_core.camera import Camera, Region
 
 GRID = 8          # the lens is evaluated on every 8th pixel; linear in between it is good to 0.01 px
-MAX_SIDE = 640    # [px]
+MAX_SIDE = 640    # of a view, unless it is given [px]
 MAX_HALF_ANGLE = math.radians(60.0)  # a pinhole stretches without bound towards 90 deg
 _BORDER = np.linspace(-1.0, 1.0, 9)  # places along a side of the view; between them the lens bends it by less than a pixel
 _BORDER = np.concatenate([np.stack(pair, axis=-1) for ends in (-np.ones(9), np.ones(9)) for pair in ((_BORDER, ends), (ends, _BORDER))])
@@ -42,13 +42,14 @@ class VirtualView:
         return 0.5 * (self.side - 1)
 
     @classmethod
-    def aim(cls, direction_C: np.ndarray, half_angle: float, focal: float) -> VirtualView:
+    def aim(cls, direction_C: np.ndarray, half_angle: float, focal: float, max_side: int = MAX_SIDE) -> VirtualView:
         """Return the view along a direction that shows everything within an angle of it.
 
         Args:
             direction_C: viewing direction, shape (3,), any length.
             half_angle: angle that must be visible around it [rad]; limited to 60 deg.
-            focal: desired focal length [px]; reduced where the image would exceed 640 px.
+            focal: desired focal length [px]; reduced where the image would exceed `max_side`.
+            max_side: greatest width and height, a multiple of `GRID` [px].
         """
         z = direction_C / np.linalg.norm(direction_C)
         x = so3.cross(np.array([0.0, 1.0, 0.0]), z)
@@ -56,8 +57,8 @@ class VirtualView:
             x = so3.cross(np.array([1.0, 0.0, 0.0]), z)
         x /= np.linalg.norm(x)
         extent = 2.0 * math.tan(min(half_angle, MAX_HALF_ANGLE))
-        focal = min(focal, MAX_SIDE / extent)
-        side = min(MAX_SIDE, GRID * math.ceil(focal * extent / GRID + 1))
+        focal = min(focal, max_side / extent)
+        side = min(max_side, GRID * math.ceil(focal * extent / GRID + 1))
         return cls(np.stack([x, so3.cross(z, x), z], axis=1), focal, side)
 
     def rays(self, pixels: np.ndarray) -> np.ndarray:
