@@ -52,7 +52,7 @@ def _enclose(coefficients: Array, limit: float, attained_elsewhere: float) -> tu
 
 
 @compiled
-def thrust_extrema(coefficients: Array, durations: Array, low: float, high: float) -> tuple[Array, float, float]:
+def thrust_extrema(coefficients: Array, durations: Array, low: float, high: float) -> tuple[Array, float, float, Array, Array]:
     """Least and greatest specific thrust of each segment. [M:eq9] [defines M:eq16]
 
     A segment's extrema are enclosed closely where they violate a limit or are those of the whole plan; the bounds of other
@@ -64,15 +64,16 @@ def thrust_extrema(coefficients: Array, durations: Array, low: float, high: floa
         low, high: limits of the specific thrust [m/s^2].
 
     Returns:
-        (extrema, least, most): extrema, shape (f, 6): attained minimum, proved minimum, place, attained maximum, proved
-        maximum, place; proved minimum and maximum of the whole plan [m/s^2].
+        (extrema, least, most, forces, squares): extrema, shape (f, 6): attained minimum, proved minimum, place, attained maximum,
+        proved maximum, place; proved minimum and maximum of the whole plan [m/s^2]; f and |f|^2, shapes (f, 3, 13) and (f, 25).
     """
     f = len(durations)
-    out = np.empty((f, 6))
+    out, forces = np.empty((f, 6)), np.empty((f, 3, 13))
     upper, lower = np.empty((f, 25)), np.empty((f, 25))  # |f|^2, -|f|^2
     least, most = -np.inf, -np.inf  # attained, of -|f|^2 and |f|^2
     for i in range(f):
-        row = squared(specific_force(coefficients[i], durations[i]))
+        forces[i] = specific_force(coefficients[i], durations[i])
+        row = squared(forces[i])
         for k in range(25):
             upper[i, k], lower[i, k] = row[k], -row[k]
         least, most = max(least, max(-row[0], -row[24])), max(most, max(row[0], row[24]))
@@ -85,7 +86,7 @@ def thrust_extrema(coefficients: Array, durations: Array, low: float, high: floa
         most = max(most, attained)
         out[i, 3], out[i, 4], out[i, 5] = sqrt(attained), sqrt(proved), place
         proved_least, proved_most = min(proved_least, out[i, 1]), max(proved_most, out[i, 4])
-    return out, proved_least, proved_most
+    return out, proved_least, proved_most, forces, upper
 
 
 @compiled
@@ -150,7 +151,7 @@ def _record_failure(where: Array, row: int, segment: int, place: float) -> None:
 
 
 @compiled
-def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S: Array, v_S: Array, s3: Array,
+def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, forces: Array, squares: Array, p_S: Array, v_S: Array, s3: Array,
           low_thrust: float, high_thrust: float, speed: float, low_height: float, high_height: float, extension: float,
           clearance: float, offset: float, rate: float) -> tuple[Array, Array, bool]:
     """Prove every limit of a plan, or find where it fails.
@@ -159,7 +160,7 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
         yaw: of the heading, shape (f, 15) [rad].
         durations: shape (f,) [s].
-        thrust: extrema from `thrust_extrema`.
+        thrust, forces, squares: extrema, f and |f|^2 from `thrust_extrema`.
         p_S, v_S, s3: point of the surface at time 0 [m], its velocity [m/s], outward normal, each shape (3,).
         low_thrust, high_thrust: limits of the specific thrust [m/s^2].
         speed: limit [m/s].
@@ -212,14 +213,13 @@ def check(coefficients: Array, yaw: Array, durations: Array, thrust: Array, p_S:
             _record_failure(where, HEIGHT, i, place)
         begin += T
 
-    forces, squares, jerks, distances = np.empty((f, 3, 13)), np.empty((f, 25)), np.empty((f, 3, 12)), np.empty((f, 15))
+    jerks, distances = np.empty((f, 3, 12)), np.empty((f, 15))
     # Backwards, as the vehicle turns and comes near at the end: most segments before need no samples then.
     gap_sampled, rate_sampled = np.inf, min(1e-3, 0.5 * rate)
     coarse = np.empty(f)
     for i in range(f - 1, -1, -1):
         T, c, heading = durations[i], coefficients[i], yaw[i:i + 1]
-        forces[i], jerks[i] = specific_force(c, T), time_derivative(c, 3, T)
-        squares[i], distances[i] = squared(forces[i]), surface_distance(c, T, begins[i], p_S, v_S, s3)
+        jerks[i], distances[i] = time_derivative(c, 3, T), surface_distance(c, T, begins[i], p_S, v_S, s3)
         coarse[i] = rate_coarse_bound(forces[i], squares[i], jerks[i], yaw[i], T)
         if smallest(distances[i]) - extension >= gap_sampled and coarse[i] <= min(rate_sampled, 0.999 * rate):
             continue

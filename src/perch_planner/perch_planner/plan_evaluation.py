@@ -84,14 +84,14 @@ def check_plan(coefficients: Array, yaw: Array, heading: Array, durations: Array
         thrusts: from `rotor_thrusts.sample_rotor_thrusts`, empty where the rotors were not checked.
     """
     p_S, v_S, s3, turn_direction, low, high, speed, low_height, high_height, extension, clearance, offset, rate, small_violation, waypoints = plan_limits
-    extrema, least, most = thrust_extrema(coefficients, durations, low, high)
+    extrema, least, most, forces, squares = thrust_extrema(coefficients, durations, low, high)
     violated = most > high or least < low
     stretch = violated and allow_stretch and _prefer_stretch(extrema, high, waypoints)
     checked = not violated or (after_first and not stretch and min(high - most, least - low) > -small_violation)
     results, where, holds, rotors_hold = np.empty((6, 5)), np.full((5, 2), -1.0), False, True
     if checked:
-        results[:5], where, holds = check(coefficients, yaw, durations, extrema, p_S, v_S, s3, low, high, speed, low_height,
-                                          high_height, extension, clearance, offset, rate)
+        results[:5], where, holds = check(coefficients, yaw, durations, extrema, forces, squares, p_S, v_S, s3, low, high, speed,
+                                          low_height, high_height, extension, clearance, offset, rate)
     thrusts = np.empty((0, 4, 0))
     if checked or not (after_first or stretch or least < _ROTOR_CHECK_SHARE * low):
         low_rotor, high_rotor, mass, J, mixing = rotors
