@@ -102,7 +102,7 @@ TOPICS = (
     Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value, rate_max=300),
     Topic("vio/debug_image", Image, qos.IMAGE, sensing.pack_image, sensing.unpack_image, packed=True, size_max=IMAGE_MAX),
     Topic("vio/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
-    Topic("vio/state", VioState, qos.SENSOR, states.inertial_message, states.inertial_value),
+    Topic("vio/state", VioState, qos.SENSOR, fast.pack_inertial, fast.unpack_inertial, packed=True),
     Topic("odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
     Topic("estimator/status", EstimatorStatus, qos.STATE, states.health_message, states.health_value),
     Topic("target/pose", PoseWithCovarianceStamped, qos.LATCHED, perching.target_message, perching.target_value, rate_max=500),
