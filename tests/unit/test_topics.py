@@ -88,6 +88,12 @@ def test_what_a_message_does_not_hold_is_not_read_of_it(channel, value, spoil, w
         topics.decode(channel, serialize_message(msg))
 
 
+def test_a_time_is_one_message_for_all_nodes_of_a_process():
+    to_message = topics.topic("/clock").to_message
+    assert to_message(5_000_000_123) is to_message(5_000_000_123)
+    assert [topics.topic("/clock").to_value(to_message(stamp)) for stamp in (7, 5_000_000_123, 7)] == [7, 5_000_000_123, 7]
+
+
 def test_cameras_share_a_row():
     assert topics.topic("camera_front/image_raw") is topics.topic("camera_down/image_raw")
     assert topics.topic("camera_front/image_raw/compressed").message.__name__ == "CompressedImage"
