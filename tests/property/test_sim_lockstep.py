@@ -557,6 +557,17 @@ def test_a_message_is_read_whole_by_one_call_unless_it_is_large(listener, monkey
         receive(connection)
 
 
+def test_a_message_of_nonsense_length_is_not_given_memory(listener, monkeypatch):
+    vehicle, connect = listener
+    participant, sizes, read = connect(b'{"node": "vio", "inputs": []}'), [], os.read
+    [(_, _, connection)] = vehicle.accept()
+    monkeypatch.setattr("os.read", lambda file, size: sizes.append(size) or read(file, min(size, 1000)))
+    os.write(participant.fileno(), struct.pack("!i", (1 << 31) - 1) + b"nonsense")
+    with pytest.raises(BlockingIOError):
+        receive(connection)
+    assert max(sizes) <= 1 << 20
+
+
 @pytest.mark.parametrize("greeting", [b"", b"\xff", b"3", b"{}", b'{"node": "vio", "inputs": 3}', b"[" * 60_000])
 def test_who_greets_with_nonsense_is_no_participant(listener, greeting):
     vehicle, connect = listener

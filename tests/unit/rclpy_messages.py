@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from perch_core.ros.messages.basic import flat, header, to_pose, to_quaternion, to_vector
-from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust, RotorState
+from perch_core.ros.messages.basic import flat, header, to_point, to_pose, to_quaternion, to_vector
+from perch_core.values import AttitudeThrust, ImuSample, InertialState, MotorCommand, OdometryState, RatesThrust, RotorState
 from perch_msgs import msg as perch_msgs
 from sensor_msgs.msg import Imu
 
@@ -29,6 +29,13 @@ def _odometry(state):
     return msg
 
 
+def _inertial(state):
+    return perch_msgs.VioState(
+        header=header(state.stamp, state.frame), position=to_point(state.p_WB), orientation=to_quaternion(state.q_WB),
+        velocity=to_vector(state.v_WB), gyro_bias=to_vector(state.gyro_bias), accel_bias=to_vector(state.accel_bias),
+        covariance=flat(state.covariance))
+
+
 def _motor(command):
     return perch_msgs.MotorCommand(header=header(command.stamp, "base_link"), armed=command.armed, rotor_speed=np.array(command.rotor_speed))
 
@@ -47,4 +54,5 @@ def _rotors(state):
     return perch_msgs.RotorState(header=header(state.stamp, "base_link"), rotor_speed=np.array(state.speed), thrust=np.array(state.thrust))
 
 
-MESSAGES = {ImuSample: _imu, OdometryState: _odometry, MotorCommand: _motor, RatesThrust: _rates, AttitudeThrust: _attitude, RotorState: _rotors}
+MESSAGES = {ImuSample: _imu, OdometryState: _odometry, InertialState: _inertial, MotorCommand: _motor, RatesThrust: _rates, AttitudeThrust: _attitude,
+            RotorState: _rotors}

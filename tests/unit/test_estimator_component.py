@@ -189,6 +189,16 @@ def test_measurements_of_another_time_are_refused(shift):
     hover.fly(0.2).assert_running()
 
 
+def test_odometry_that_is_ignored_is_not_converted(monkeypatch):
+    hover = Hover(vio=None).fly(0.1)
+    hover.tell(state(hover.now))
+    hover.fly(0.01).assert_running()
+    monkeypatch.setattr("perch_perception.estimator_component.pose_of", None)
+    hover.tell(odometry(hover.now))
+    hover.fly(0.01).assert_running()
+    assert hover.out.warnings() == []
+
+
 def test_a_saturated_sample_gets_its_odometry():
     hover = Hover().fly(1.0)
     for _ in range(3):

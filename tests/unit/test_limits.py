@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import inf, nan
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from perch_core.errors import ConfigError
 from perch_core.ros import topics
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.values import (
-    AttitudeThrust, ImuSample, MappedPowerline, MotorCommand, OdometryState, PerchGoal, PowerlineMap, RatesThrust, RotorState, TrajectoryOrder,
-    limits)
+    AttitudeThrust, ImuSample, InertialState, MappedPowerline, MotorCommand, OdometryState, PerchGoal, PowerlineMap, RatesThrust, RotorState,
+    TrajectoryOrder, limits)
 from perch_eval.limits_page import page
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,6 +70,14 @@ def test_valid_floats_are_judged_without_numpy(monkeypatch):
     state = RotorState(7, (1200.0, 1200.0, 1200.0, 1200.0), (0.7, 0.7, 0.7, 0.7))
     monkeypatch.setattr(limits, "np", None)
     assert not limits.problem(state)
+
+
+def test_valid_vectors_are_judged_without_numpys_comparisons(monkeypatch):
+    limit = limits.LIMITS[InertialState]["p_WB"]
+    refused = [limit.problem(np.array(value)) for value in ([1e5, 0.0, 0.0], [0.0, np.nan, 0.0], [0.0, 0.0])]
+    assert refused == ["100000 is outside [-10000, 10000] m", "nan is not finite", "shape (2,) is not 3"]
+    monkeypatch.setattr(limits, "np", SimpleNamespace(asarray=np.asarray))
+    assert not limit.problem(np.array([1.0, -2.0, 1e4]))
 
 
 def test_a_request_is_refused_with_its_source():

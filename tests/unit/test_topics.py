@@ -11,7 +11,7 @@ from perch_core.ros import topics
 from perch_core.ros.goal_server import ServedGoal
 from perch_core.ros.intake import Intake
 from perch_core.ros.messages.sensing import imu_value
-from perch_core.values import AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust, RotorState
+from perch_core.values import AttitudeThrust, ImuSample, InertialState, MotorCommand, OdometryState, RatesThrust, RotorState
 from perch_msgs.action import Perch
 from perch_sim.scenario import NODES
 from unit.rclpy_messages import message_of
@@ -30,6 +30,7 @@ def _odometry(frame="map"):
 
 FAST = [("imu/data_raw", ImuSample(1_234_567_891, _floats(3), _floats(3), frame)) for frame in ("imu_link", "", "a", "abcdefgh")]
 FAST += [("odometry", _odometry(frame)) for frame in ("map", "odom", "x")]
+FAST += [("vio/state", InertialState(1_234_567_891, *(RNG.standard_normal(n) for n in (3, 4, 3, 3, 3)), RNG.standard_normal((15, 15))))]
 FAST += [("motor_command", MotorCommand(77, armed, _floats(4))) for armed in (True, False)]
 FAST += [("rates_thrust_command", RatesThrust(77, armed, _floats(3), 9.5)) for armed in (True, False)]
 FAST += [("attitude_thrust_command", AttitudeThrust(77, armed, _floats(4), _floats(3), 9.5)) for armed in (True, False)]
@@ -85,6 +86,12 @@ def test_what_a_message_does_not_hold_is_not_read_of_it(channel, value, spoil, w
             imu_value(msg)
     with pytest.raises(PerchError, match=words):
         topics.decode(channel, serialize_message(msg))
+
+
+def test_a_time_is_one_message_for_all_nodes_of_a_process():
+    to_message = topics.topic("/clock").to_message
+    assert to_message(5_000_000_123) is to_message(5_000_000_123)
+    assert [topics.topic("/clock").to_value(to_message(stamp)) for stamp in (7, 5_000_000_123, 7)] == [7, 5_000_000_123, 7]
 
 
 def test_cameras_share_a_row():

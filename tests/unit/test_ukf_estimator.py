@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_eval import consistency
-from perch_perception.ukf import Health
+from perch_perception.ukf import Estimator, Health, UkfConfig, VioPose
+from perch_perception.ukf.config import VioNoise
+from scipy.linalg import block_diag
 from unit.estimator_flight import DT, IMU, WHITE, Flight
 
 
@@ -93,6 +95,17 @@ def test_a_velocity_counts_as_much_as_its_covariance_says():
 
 
 @pytest.mark.slow
+def test_the_noise_of_pose_and_velocity_is_that_of_vio_and_what_is_added(monkeypatch):
+    estimator, used = Estimator(UkfConfig(vio=VioNoise(position=0.1, attitude=0.2))), []
+    monkeypatch.setattr(estimator._transform, "innovate", lambda prior, pose, R: used.append(R))
+    pose = VioPose(0, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.full((6, 6), 1.0), np.zeros(3), np.full((3, 3), 2.0))
+    for measured in (pose, replace(pose, velocity_covariance=None)):
+        estimator._innovate(None, measured)
+    expected = np.full((6, 6), 1.0) + np.diag([0.01] * 3 + [0.04] * 3)
+    np.testing.assert_allclose(used[0], block_diag(expected, np.full((3, 3), 2.0)))
+    np.testing.assert_allclose(used[1], expected)
+
+
 def test_forty_milliseconds_of_delay_cost_less_than_a_fifth():
     prompt, late = relative_rmse(0.0), relative_rmse(0.040)
     assert late < 1.2 * prompt

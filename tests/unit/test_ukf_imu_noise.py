@@ -66,3 +66,16 @@ def test_samples_on_both_sides_of_a_gap_are_not_compared():
     for k in range(4):
         imu.add(ImuSample(last + 100_000_000 + 2_000_000 * k, (1.0, 2.0, 3.0), (20.0, 0.0, 9.81)))
     assert imu.latest[8] == pytest.approx(0.1 * IMU.accel_noise_density**2 * 500.0)
+
+
+def test_a_run_has_whole_steps_as_they_are_and_cuts_the_first_and_the_last():
+    imu = ImuBuffer(ImuNoise(), 1.0)
+    for k in range(6):
+        imu.add(ImuSample(2_000_000 * k, (0.1 * k, 0.0, 0.0), (0.0, 0.0, 9.81)))
+    whole, cut, within = imu.run(2_000_000, 10_000_000), imu.run(3_000_000, 9_500_000), imu.run(4_500_000, 5_000_000)
+    assert np.array_equal(whole, np.array(imu._rows[1:]))
+    np.testing.assert_allclose(cut[:, 0], [0.001, 0.002, 0.002, 0.0015], rtol=1e-12)
+    for column in (7, 8):
+        np.testing.assert_allclose(cut[:, column] / whole[:, column], [2.0, 1.0, 1.0, 4.0 / 3.0], rtol=1e-12)
+        np.testing.assert_allclose(within[:, column] / whole[1, column], [4.0], rtol=1e-12)
+    assert np.array_equal(cut[1:-1], whole[1:-1]) and np.array_equal(cut[:, 1:7], whole[:, 1:7])

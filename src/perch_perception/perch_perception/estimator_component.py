@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,7 +13,7 @@ from perch_core.values import EstimatorHealth, ImuSample, InertialState, Odometr
 from perch_perception.estimators import EstimatorConfig
 from perch_perception.imu_intake import ImuIntake
 from perch_perception.sensor_file import imu_noise
-from perch_perception.ukf import Estimator, VioOutcome, VioPose
+from perch_perception.ukf import Estimator, VioOutcome
 from perch_perception.ukf.estimator import COVARIANCE_STRIDE
 from perch_perception.ukf.imu_buffer import ImuOutcome
 from perch_perception.ukf.odometry import covariances, pose_of, state_of
@@ -27,7 +25,6 @@ DIAGNOSTICS_PHASE = 334_000_000    # not with the status
 STATE_VALIDITY = 1_000_000_000     # time after VIO's last whole state in which its odometry is ignored [ns]
 MAX_PENDING = 20                   # measurements that wait for the next IMU sample
 _NEVER = -(1 << 62)
-V = TypeVar("V", InertialState, OdometryState)
 
 
 class StateEstimator(Component[EstimatorConfig]):
@@ -57,7 +54,7 @@ class StateEstimator(Component[EstimatorConfig]):
     def _begin(self) -> None:
         """Reset to the state before the first sample."""
         self.filter = Estimator(self.config)
-        self._pending: list[tuple[int, bool, VioPose]] = []  # (stamp, odometry rather than a state, pose)
+        self._pending: list[InertialState | OdometryState] = []
         self._newest_state = _NEVER
         self._covariances = (np.zeros((6, 6)), np.zeros((6, 6)))
         self._covariance_age = COVARIANCE_STRIDE  # IMU samples since they were computed
@@ -70,11 +67,11 @@ class StateEstimator(Component[EstimatorConfig]):
 
     def on_vio_state(self, state: InertialState) -> None:
         """Keep VIO's state for the next IMU sample."""
-        self._queue_measurement("vio/state", state, state_of)
+        self._queue_measurement("vio/state", state)
 
     def on_vio_odometry(self, odometry: OdometryState) -> None:
         """Keep VIO's odometry for the next IMU sample."""
-        self._queue_measurement("vio/odometry", odometry, pose_of)
+        self._queue_measurement("vio/odometry", odometry)
 
     def on_rotors(self, rotors: RotorState) -> None:
         """Take the state of the rotors: where they stand, a vehicle with a quiet IMU rests."""
@@ -107,33 +104,35 @@ class StateEstimator(Component[EstimatorConfig]):
             self._diagnoses = (since - DIAGNOSTICS_PHASE) // DIAGNOSTICS_PERIOD + 1
             self._diagnose(sample.stamp)
 
-    def _queue_measurement(self, channel: str, value: V, read: Callable[[V], VioPose]) -> None:
-        """Check and convert a measurement, and store it for the next IMU sample."""
+    def _queue_measurement(self, channel: str, value: InertialState | OdometryState) -> None:
+        """Check the frame of a measurement, and store it for the next IMU sample."""
         if not is_world(value.frame):
             self.warn(f"{channel}: frame {value.frame!r} is not a known fixed frame: ignored", 1.0)
-            return
-        try:
-            pose = read(value)
-        except (PerchError, TypeError, ValueError) as error:
-            self.warn(f"{channel}: {error}: not used", 1.0)
             return
         if len(self._pending) >= MAX_PENDING:
             self.warn(f"{channel}: more than {MAX_PENDING} values without an IMU sample: the oldest are dropped", 1.0)
             self._pending.pop(0)
-        self._pending.append((pose.stamp, pose.inertial is None, pose))
+        self._pending.append(value)
 
     def _use_vio(self) -> None:
         """Apply the stored measurements in the order of their stamps; at the same stamp, the state precedes the odometry."""
-        pending, self._pending = sorted(self._pending, key=lambda entry: entry[:2]), []
-        for stamp, is_odometry, pose in pending:
+        pending, self._pending = sorted(self._pending, key=lambda value: (value.stamp, isinstance(value, OdometryState))), []
+        for value in pending:
+            stamp, is_odometry = value.stamp, isinstance(value, OdometryState)
             if is_odometry and stamp <= self._newest_state + STATE_VALIDITY:
+                continue
+            channel = "vio/odometry" if is_odometry else "vio/state"
+            try:
+                pose = pose_of(value) if isinstance(value, OdometryState) else state_of(value)
+            except (PerchError, TypeError, ValueError) as error:
+                self.warn(f"{channel}: {error}: not used", 1.0)
                 continue
             outcome = self.filter.add_vio(pose)
             if not is_odometry and (outcome.used or outcome is VioOutcome.DUPLICATE):
                 self._newest_state = stamp
             self._covariance_age = COVARIANCE_STRIDE
             if outcome not in (VioOutcome.STARTED, VioOutcome.APPLIED, VioOutcome.WAITING, VioOutcome.NO_IMU):
-                self.warn(f"{'vio/odometry' if is_odometry else 'vio/state'}: at {stamp} ns {outcome.value}", 1.0)
+                self.warn(f"{channel}: at {stamp} ns {outcome.value}", 1.0)
 
     def _emit(self, stamp: int, motion: tuple[float, ...]) -> None:
         if self._covariance_age >= COVARIANCE_STRIDE and (e := self.filter.estimate) is not None:

@@ -94,6 +94,12 @@ class Topic:
         return bool(self.qos.publish.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+@lru_cache(maxsize=1)
+def _clock_message(stamp: int) -> Clock:
+    """Return the message of a time [ns], the same one for all nodes of a process."""
+    return Clock(clock=to_stamp(stamp))
+
+
 TOPICS = (
     Topic("imu/data_raw", Imu, qos.SENSOR, fast.pack_imu, fast.unpack_imu, packed=True),
     Topic("camera_*/image_raw", Image, qos.IMAGE, sensing.pack_image, sensing.unpack_image, packed=True, size_max=IMAGE_MAX, rate_max=300),
@@ -102,7 +108,7 @@ TOPICS = (
     Topic("camera_*/camera_info", CameraInfo, qos.IMAGE, sensing.camera_info_message, sensing.camera_info_value, rate_max=300),
     Topic("vio/debug_image", Image, qos.IMAGE, sensing.pack_image, sensing.unpack_image, packed=True, size_max=IMAGE_MAX),
     Topic("vio/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
-    Topic("vio/state", VioState, qos.SENSOR, states.inertial_message, states.inertial_value),
+    Topic("vio/state", VioState, qos.SENSOR, fast.pack_inertial, fast.unpack_inertial, packed=True),
     Topic("odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True),
     Topic("estimator/status", EstimatorStatus, qos.STATE, states.health_message, states.health_value),
     Topic("target/pose", PoseWithCovarianceStamped, qos.LATCHED, perching.target_message, perching.target_value, rate_max=500),
@@ -120,7 +126,7 @@ TOPICS = (
     Topic("contact", Contact, qos.EVENT, states.contact_message, states.contact_value),
     Topic("ground_truth/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True, observed=True),
     Topic("ground_truth/target", PoseStamped, qos.LATCHED, states.pose_message, states.pose_value),
-    Topic("/clock", Clock, qos.CLOCK, lambda stamp: Clock(clock=to_stamp(stamp)), lambda msg: stamp_value(msg.clock), observed=True),
+    Topic("/clock", Clock, qos.CLOCK, _clock_message, lambda msg: stamp_value(msg.clock), observed=True),
     Topic("/diagnostics", DiagnosticArray, qos.STATE, diagnostics_message, diagnostics_value),
     Topic("markers", MarkerArray, qos.STATE, markers.markers_message, markers.markers_value),
     Topic("/tf", TFMessage, qos.SENSOR, lambda value: TFMessage(transforms=[sensing.stamped_transform_message(value)]),

@@ -58,6 +58,8 @@ class Limit:
             array = np.asarray(value, float)
         except (TypeError, ValueError, OverflowError):
             return "is not made of numbers"
+        if array.ndim == 1 and array.shape == self.shape and all(self.low <= x <= self.high for x in array.tolist()):
+            return ""
         many = self.shape[:1] == (-1,)
         if many and len(array.shape) and not array.size:
             return ""

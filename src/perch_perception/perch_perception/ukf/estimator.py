@@ -11,7 +11,6 @@ import dataclasses
 import math
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from perch_core.values import ImuSample, RotorState
 from perch_perception.ukf import kernels, start
@@ -42,7 +41,7 @@ class Estimator:
 
     def __init__(self, config: UkfConfig = UkfConfig()) -> None:
         self.config = config
-        self._transform = UnscentedTransform(config)
+        self._transform, self._added_noise = UnscentedTransform(config), start.added_noise(config.vio)
         self._imu = ImuBuffer(config.imu, _HISTORY)
         self._base: Belief | None = None  # at the stamp of the last applied pose, or of rest
         self._newest_vio_stamp = self._applied = 0   # newest stamp of any pose, and of an applied one [ns]
@@ -202,9 +201,11 @@ class Estimator:
         return next(a for a in reversed(self._anchors) if a.stamp <= stamp)
 
     def _innovate(self, prior: Belief, pose: VioPose) -> Innovation:
-        R = pose.covariance + start.added_noise(self.config.vio)
+        m = 6 if pose.velocity_covariance is None else 9
+        R = np.zeros((m, m))
+        R[:6, :6] = pose.covariance + self._added_noise
         if pose.velocity_covariance is not None:
-            R = block_diag(R, pose.velocity_covariance)
+            R[6:, 6:] = pose.velocity_covariance
         return self._transform.innovate(prior, pose, R)
 
     def _inflated(self, prior: Belief, innovation: Innovation) -> Belief:

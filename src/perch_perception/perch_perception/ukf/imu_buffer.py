@@ -186,12 +186,13 @@ class ImuBuffer:
             return rows
         if sensor_noise:
             rows[:, 7:] = self._sensor_noise[first : last + 1]
-        begins = self._ends[first] - round(rows[0, 0] * 1e9)
-        whole = rows[[0, -1], 0]
-        rows[0, 0] -= max(0, start - begins) * 1e-9
-        rows[-1, 0] -= max(0, self._ends[last] - end) * 1e-9
-        if len(rows) == 1:
-            rows[0, 7:] *= whole[0] / rows[0, 0]
-        else:
-            rows[[0, -1], 7:] *= (whole / rows[[0, -1], 0])[:, None]
+        before, after = start - self._ends[first] + round(rows[0, 0] * 1e9), self._ends[last] - end
+        if before <= 0 and after <= 0:
+            return rows
+        whole_first, whole_last = rows[0, 0], rows[-1, 0]
+        rows[0, 0] -= max(0, before) * 1e-9
+        rows[-1, 0] -= max(0, after) * 1e-9
+        rows[0, 7:] *= whole_first / rows[0, 0]
+        if len(rows) > 1:
+            rows[-1, 7:] *= whole_last / rows[-1, 0]
         return rows

@@ -26,6 +26,7 @@ _RECEIVE_LIMIT = struct.pack("ll", 10, 0)                     # ... and for the 
 _SEND_BUFFER = 1 << 20                                       # holds an image, so that the vehicle does not wait for its reader [B]
 _LENGTH = struct.Struct("!i")                                 # of a message, as in multiprocessing
 _READ = 1 << 13                                               # holds the batch of a fast participant [B]
+_READ_MAX = 1 << 20                                           # asked for at a time, whatever length a message states [B]
 
 
 def address(domain: str, namespace: str) -> str:
@@ -193,7 +194,7 @@ def receive(connection: Connection) -> bytes:
         data += _read(connection, _READ)
     parts, left = [data[_LENGTH.size:]], _LENGTH.size + _LENGTH.unpack_from(data)[0] - len(data)
     while left > 0:
-        parts.append(_read(connection, left))
+        parts.append(_read(connection, min(left, _READ_MAX)))
         left -= len(parts[-1])
     if left < 0:
         raise PerchError("lockstep: more than one message at a time")

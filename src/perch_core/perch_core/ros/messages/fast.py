@@ -9,14 +9,16 @@ from nav_msgs.msg import Odometry
 from perch_core.errors import PerchError
 from perch_core.ros.cdr import Layout
 from perch_core.ros.messages.basic import require_measured
-from perch_core.values import NANOSECONDS, AttitudeThrust, ImuSample, MotorCommand, OdometryState, RatesThrust, RotorState
+from perch_core.values import (
+    NANOSECONDS, AttitudeThrust, ImuSample, InertialState, MotorCommand, OdometryState, RatesThrust, RotorState)
 from perch_msgs.msg import AttitudeThrust as AttitudeMessage
 from perch_msgs.msg import MotorCommand as MotorMessage
 from perch_msgs.msg import RatesThrust as RatesMessage
 from perch_msgs.msg import RotorState as RotorsMessage
+from perch_msgs.msg import VioState
 from sensor_msgs.msg import Imu
 
-_IMU, _ODOMETRY, _MOTOR, _ROTORS = map(Layout, (Imu, Odometry, MotorMessage, RotorsMessage))
+_IMU, _ODOMETRY, _INERTIAL, _MOTOR, _ROTORS = map(Layout, (Imu, Odometry, VioState, MotorMessage, RotorsMessage))
 _RATES, _ATTITUDE = map(Layout, (RatesMessage, AttitudeMessage))
 _NO_ORIENTATION = np.r_[0.0, 0.0, 0.0, 1.0, -1.0, np.zeros(8)].tobytes()  # attitude and its covariance, -1: there is none
 _NO_COVARIANCE = np.zeros(9).tobytes()
@@ -51,6 +53,19 @@ def unpack_odometry(data: bytes) -> OdometryState:
     pose, twist, covariances = _7.unpack_from(x), _6.unpack_from(x, 43 * 8), np.frombuffer(x, "<f8")
     return OdometryState(sec * NANOSECONDS + nanosec, pose[:3], pose[3:], twist[:3], twist[3:],
                          covariances[7:43].reshape(6, 6), covariances[49:85].reshape(6, 6), frame)
+
+
+def pack_inertial(s: InertialState) -> bytes:
+    """Return the serialised `perch_msgs/VioState` of a state."""
+    floats = np.concatenate([s.p_WB, s.q_WB, s.v_WB, s.gyro_bias, s.accel_bias, np.reshape(s.covariance, 225)]).astype("<f8").tobytes()
+    return _INERTIAL.pack(*divmod(s.stamp, NANOSECONDS), s.frame, floats)
+
+
+def unpack_inertial(data: bytes) -> InertialState:
+    """Return the state of a `perch_msgs/VioState`."""
+    sec, nanosec, frame, floats = _INERTIAL.unpack(data)
+    x = np.frombuffer(floats, "<f8").copy()
+    return InertialState(sec * NANOSECONDS + nanosec, x[0:3], x[3:7], x[7:10], x[10:13], x[13:16], x[16:].reshape(15, 15), frame)
 
 
 def pack_motor(command: MotorCommand) -> bytes:

@@ -1,30 +1,12 @@
-"""Conversions of VIO's state, the estimator's health, and ground truth."""
+"""Conversions of the estimator's health, and ground truth."""
 
 from __future__ import annotations
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped as PoseStampedMessage
-from perch_core.ros.messages.basic import (
-    flat, floats, header, quaternion_floats, square, stamp_value, to_point, to_pose, to_quaternion, to_vector)
-from perch_core.values import Contact, EstimatorHealth, InertialState, PoseStamped
+from perch_core.ros.messages.basic import floats, header, quaternion_floats, stamp_value, to_pose, to_vector
+from perch_core.values import Contact, EstimatorHealth, PoseStamped
 from perch_msgs.msg import Contact as ContactMessage
-from perch_msgs.msg import EstimatorStatus, VioState
-
-
-def inertial_value(msg: VioState) -> InertialState:
-    """Convert `perch_msgs/VioState` to the full inertial state."""
-    return InertialState(
-        stamp_value(msg.header.stamp), np.array(floats(msg.position)), np.array(quaternion_floats(msg.orientation)),
-        np.array(floats(msg.velocity)), np.array(floats(msg.gyro_bias)), np.array(floats(msg.accel_bias)), square(msg.covariance, 15),
-        msg.header.frame_id)
-
-
-def inertial_message(state: InertialState) -> VioState:
-    """Convert the full inertial state to `perch_msgs/VioState`."""
-    return VioState(
-        header=header(state.stamp, state.frame), position=to_point(state.p_WB), orientation=to_quaternion(state.q_WB),
-        velocity=to_vector(state.v_WB), gyro_bias=to_vector(state.gyro_bias), accel_bias=to_vector(state.accel_bias),
-        covariance=flat(state.covariance))
+from perch_msgs.msg import EstimatorStatus
 
 
 def health_value(msg: EstimatorStatus) -> EstimatorHealth:
