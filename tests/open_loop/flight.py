@@ -6,7 +6,6 @@ For benchmarks and tests. Images, camera calibration errors and IMU are the simu
 
 from __future__ import annotations
 
-import gc
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from closed_loop.plant import NoParameters
 from perch_core import so3
 from perch_core.camera_mount import CameraMount
 from perch_core.component import Component, Input, Output
-from perch_core.processes import freeze_heap
+from perch_core.processes import without_collector
 from perch_core.urdf import optical_frame
 from perch_core.values import CameraImage, CameraModel, EstimatorHealth, ImuSample, InertialState
 from perch_core.vehicle import load_vehicle
@@ -253,12 +252,9 @@ def run_vio(flight: Flight, begin: float = 0.0, level_ground: bool = True) -> li
 
 
 def _run(loop: Loop, vehicle: _Vehicle) -> None:
-    freeze_heap()  # as nodes do
-    try:
+    with without_collector():  # a trace only grows
         while not vehicle.over:
             loop.step()
-    finally:
-        gc.unfreeze()
 
 
 def _vio_error(flight: Flight, result: VioResult) -> np.ndarray | None:

@@ -124,13 +124,17 @@ if __name__ == "__main__":
 """
 
 
+FORKED = {"DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver"}
+"""Workers are forked from a process that has made Dask's imports."""
+
+
 @pytest.fixture
 def cluster(campaign, tmp_path) -> Iterator[str]:
     """Address of a Dask scheduler with two workers, whose environment gives BLAS four threads."""
     script = tmp_path / "cluster.py"
     script.write_text(CLUSTER)
     with subprocess.Popen([sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-                          env=os.environ | {"OPENBLAS_NUM_THREADS": "4"}) as process:
+                          env=os.environ | {"OPENBLAS_NUM_THREADS": "4", **FORKED}) as process:
         yield process.stdout.readline().strip()
         process.stdin.close()
 

@@ -109,7 +109,7 @@ def test_a_wall_is_perched_on_through_the_firmware():
 
 
 @pytest.mark.parametrize("vehicle", ["betaflight", "rpg_betaflight"])
-def test_vehicle_files_are_what_identification_writes(vehicle, tmp_path, monkeypatch, capsys):
+def test_vehicle_files_are_what_identification_writes(vehicle, undrawn, tmp_path, monkeypatch, capsys):
     """What flies changes, and numerics of another machine may: within three standard deviations, as the files give them.
 
     Half of the flight is flown that they are from, all of its moves once: of the drag it tells too little for a file, but what it tells is that.

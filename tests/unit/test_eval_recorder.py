@@ -261,7 +261,7 @@ def test_figures_of_a_flight_without_a_planned_perch_are_named_as_those_of_the_w
     assert {f"{one}{part}" for one in ("tracking RMSE x, y, z", "estimation RMSE x, y, z", "largest body rate", "largest acceleration")} <= set(names)
 
 
-def test_a_flight_with_a_command_and_a_contact_that_are_unknown_has_a_report(tmp_path):
+def test_a_flight_with_a_command_and_a_contact_that_are_unknown_has_a_report(undrawn, tmp_path):
     contact = Contact(2 * NANOSECONDS, 9, "wall", 0.0, 0.0, 0.0, 0.0, "")
     record(tmp_path / "flight.mcap", flown() | {"controller/command": [(1.0, ControllerCommand(NANOSECONDS, 77, "by hand"))], "contact": [(2.0, contact)]})
     build_report(tmp_path, load_scenario("surface_90"), 3, "perched", "held", 2.0, 4.0)
