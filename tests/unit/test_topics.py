@@ -88,6 +88,13 @@ def test_what_a_message_does_not_hold_is_not_read_of_it(channel, value, spoil, w
         topics.decode(channel, serialize_message(msg))
 
 
+@pytest.mark.parametrize("field, size", [("v_WB", 2), ("p_WB", 4), ("covariance", 36)])
+def test_a_state_of_other_sizes_is_not_written(field, size):
+    state = next(value for channel, value in FAST if channel == "vio/state")
+    with pytest.raises(ValueError):
+        topics.encode("vio/state", state._replace(**{field: np.zeros(size)}))
+
+
 def test_a_time_is_one_message_for_all_nodes_of_a_process():
     to_message = topics.topic("/clock").to_message
     assert to_message(5_000_000_123) is to_message(5_000_000_123)

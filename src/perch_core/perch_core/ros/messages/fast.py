@@ -57,8 +57,9 @@ def unpack_odometry(data: bytes) -> OdometryState:
 
 def pack_inertial(s: InertialState) -> bytes:
     """Return the serialised `perch_msgs/VioState` of a state."""
-    floats = np.concatenate([s.p_WB, s.q_WB, s.v_WB, s.gyro_bias, s.accel_bias, np.reshape(s.covariance, 225)]).astype("<f8").tobytes()
-    return _INERTIAL.pack(*divmod(s.stamp, NANOSECONDS), s.frame, floats)
+    x = np.empty(241, "<f8")
+    np.concatenate([s.p_WB, s.q_WB, s.v_WB, s.gyro_bias, s.accel_bias, np.reshape(s.covariance, 225)], out=x)  # refuses other sizes
+    return _INERTIAL.pack(*divmod(s.stamp, NANOSECONDS), s.frame, x.tobytes())
 
 
 def unpack_inertial(data: bytes) -> InertialState:
