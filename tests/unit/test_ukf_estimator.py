@@ -94,7 +94,6 @@ def test_a_velocity_counts_as_much_as_its_covariance_says():
     assert errors[0.003] < 0.01 < 0.015 < errors[3.0]
 
 
-@pytest.mark.slow
 def test_the_noise_of_pose_and_velocity_is_that_of_vio_and_what_is_added(monkeypatch):
     estimator, used = Estimator(UkfConfig(vio=VioNoise(position=0.1, attitude=0.2))), []
     monkeypatch.setattr(estimator._transform, "innovate", lambda prior, pose, R: used.append(R))
@@ -106,6 +105,7 @@ def test_the_noise_of_pose_and_velocity_is_that_of_vio_and_what_is_added(monkeyp
     np.testing.assert_allclose(used[1], expected)
 
 
+@pytest.mark.slow
 def test_forty_milliseconds_of_delay_cost_less_than_a_fifth():
     prompt, late = relative_rmse(0.0), relative_rmse(0.040)
     assert late < 1.2 * prompt
