@@ -8,6 +8,7 @@ from perch_core.camera import PinholeCamera
 from perch_core.camera_mount import CameraMount
 from perch_core.tag_board import Tag, TagBoard, TagGrid
 from perch_perception.tags import BoardLocalizer, TagDetector, refine_corners
+from perch_perception.tags.view import VirtualView
 
 CAMERA = PinholeCamera(640, 480, 480.0, 480.0, 319.5, 239.5)
 MOUNT = CameraMount("front", CAMERA, np.zeros(3), np.eye(3))
@@ -123,6 +124,16 @@ def test_a_grid_that_is_tracked_keeps_its_small_tags(distance, least):
     tracked = localizer.process(image, 0.05).board
     position, attitude = errors(tracked, p, R)
     assert len(tracked.ids) >= least and position < 0.003 and np.degrees(attitude) < 0.3
+
+
+def test_a_view_of_tiny_tags_on_a_large_board_has_a_bounded_size(monkeypatch):
+    centres = ((0.4, 0.4), (0.4, -0.4), (-0.4, -0.4), (-0.4, 0.4))
+    board = TagBoard((10.0, 10.0), (*(Tag(i, c, 0.01) for i, c in enumerate(centres)), Tag(4, (4.5, 0.0), 0.9)))
+    sides, resample = [], VirtualView.resample
+    monkeypatch.setattr(VirtualView, "resample", lambda view, *arguments: sides.append(view.side) or resample(view, *arguments))
+    image = photographed([(pad((4, 1, 2, 3)), np.array([0.0, 0.0, 2.5]), FACING)], np.random.default_rng(3))
+    BoardLocalizer(board, MOUNT).process(image, 0.0)
+    assert sides == [2048]
 
 
 @pytest.mark.parametrize("blur", [0.6, 1.5, 2.0, 2.5])

@@ -30,6 +30,7 @@ LOST_AFTER = 0.4   # tracking without a tag before searching [s]
 MIN_RANGE = 0.15   # a nearer board is taken for one of another size [m]
 MAX_TRACKED_IMAGES = 4  # in a row in which the expected corners are measured without reading the tags' numbers
 VIEW_MARGIN = 1.2  # what is looked at around the pad, in pad sizes
+LARGEST_VIEW = 2048  # side of a view, also where the wanted size of tags demands more: 4 MB [px]
 PRINT_SIGMA = 0.0002  # of a tag's place on the board, per axis: what plotters and careful gluing keep [m]
 MAX_TRACK_GAP = 0.1   # time since the last sighting over which corners are expected well enough [s]
 MIN_TRACKED_TAGS = 3  # so many tags must be expected: their agreement shows that nothing else was measured
@@ -91,7 +92,7 @@ class BoardLocalizer:
         self._radius = float(np.linalg.norm(board.corners_S, axis=-1).max())
         # Side [px] of a view in which tags have the wanted size while the board is seen under a half angle of at most 45 deg.
         side = 2.0 * VIEW_MARGIN * VIEW_TAG_SIDE * self._radius / self._tag_size / math.cos(math.radians(45.0))
-        self._max_side = max(MAX_SIDE, GRID * math.ceil(side / GRID))
+        self._max_side = max(MAX_SIDE, min(GRID * math.ceil(side / GRID), LARGEST_VIEW))
         self._last: BoardPose | None = None       # last sighting ...
         self._last_body: BodyState | None = None  # ... where the vehicle was then ...
         self._last_time = -np.inf                 # ... and when
