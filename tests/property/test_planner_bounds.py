@@ -58,7 +58,7 @@ def test_thrust_extrema_of_a_plan_are_close_and_those_of_its_segments_are_proved
     rng = np.random.default_rng(seed)
     segments = np.cumsum(np.cumsum(rng.normal(0.0, 0.01, (4, 3, 15)), axis=2), axis=2)
     durations = rng.uniform(0.4, 1.0, 4)
-    extrema, least, most = plan_checks.thrust_extrema(segments, durations, 9.0, 16.0)
+    extrema, least, most, *_ = plan_checks.thrust_extrema(segments, durations, 9.0, 16.0)
     places = np.linspace(0.0, 1.0, 1001)
     norms = []
     for segment, duration in zip(segments, durations):
@@ -204,10 +204,10 @@ def test_a_small_limit_of_the_body_rate_is_proved_not_sampled(limit):
     rate = np.linalg.solve(nodes, [np.prod(s - samples) for s in np.linspace(0.0, 1.0, 14)])
     rate /= np.abs(bernstein.evaluate(rate, np.linspace(0.0, 1.0, 1001))).max()
     still, T, up = np.zeros((1, 3, 15)), np.ones(1), np.array([0.0, 0.0, 1.0])
-    thrust, _, _ = plan_checks.thrust_extrema(still, T, 1.0, 20.0)
+    thrust, _, _, forces, squares = plan_checks.thrust_extrema(still, T, 1.0, 20.0)
 
     def holds(yaw):
-        return plan_checks.check(still, yaw, T, thrust, -5.0 * up, 0.0 * up, up, 1.0, 20.0, 5.0, -1.0, 1.0, 0.1, 0.0, 0.0, limit)[2]
+        return plan_checks.check(still, yaw, T, thrust, forces, squares, -5.0 * up, 0.0 * up, up, 1.0, 20.0, 5.0, -1.0, 1.0, 0.1, 0.0, 0.0, limit)[2]
 
     assert not holds(np.concatenate([[0.0], np.cumsum(rate) / 14.0])[None])
     assert holds(np.zeros((1, 15)))

@@ -36,7 +36,7 @@ def test_plans_keep_the_thrust_and_end_on_the_surface_as_those_that_fly_do(asked
     printed, flies = paper_m.plan(asked, SETTINGS, VEHICLE), planner.plan(asked, SETTINGS, VEHICLE)
     assert printed.solved
     trajectory = printed.trajectory
-    _, least, most = plan_checks.thrust_extrema(np.ascontiguousarray(trajectory.coefficients[:, :3]), trajectory.durations, *BOUNDS)
+    _, least, most, *_ = plan_checks.thrust_extrema(np.ascontiguousarray(trajectory.coefficients[:, :3]), trajectory.durations, *BOUNDS)
     assert BOUNDS[0] <= least and most <= BOUNDS[1]  # what Sturm's chain said is proved by subdivision
     start = trajectory.sample(0.0)
     for name in ("p", "v", "a", "j", "yaw", "yaw_rate"):
@@ -96,7 +96,7 @@ def test_all_derivatives_up_to_the_fourth_are_continuous():
 def test_algorithm_1_decides_both_thrust_limits(low, high, kept):
     trajectory = planner.plan(CASES[1], SETTINGS, VEHICLE).trajectory
     p = np.ascontiguousarray(trajectory.coefficients[:, :3])
-    _, least, most = plan_checks.thrust_extrema(p, trajectory.durations, 0.0, 100.0)
+    _, least, most, *_ = plan_checks.thrust_extrema(p, trajectory.durations, 0.0, 100.0)
     inside = [paper_m.keeps_thrust(c, T, VEHICLE.mass, low * least * VEHICLE.mass, high * most * VEHICLE.mass)
               for c, T in zip(p, trajectory.durations)]
     assert all(inside) == kept
