@@ -19,7 +19,7 @@ from rclpy.subscription import Subscription
 MATCH_PERIOD = 1.0  # of the check of the publishers' reliability for raw inputs [s]
 TAKE_PERIOD = 0.02  # lazy inputs are read at least this often [s]
 TAKE_MAX = 200      # messages of one lazy input that are read at a time: a flood leaves time for other events
-SHARED_TOPICS = ("/tf", "/tf_static")  # topics with many publishers, inside this process and outside
+SHARED_TOPICS = ("/tf", "/tf_static")  # channels with many publishers, inside this process and outside
 
 
 class Intake:
@@ -45,7 +45,7 @@ class Intake:
             return
         resolved = node.resolve_topic_name(channel)
         handler = partial(node.guarded, port.name, port.handler(node.component))
-        if self._wiring.writer(resolved) is not None and resolved not in SHARED_TOPICS:
+        if self._wiring.writer(resolved) is not None and channel not in SHARED_TOPICS:
             self.private.add(resolved)
             self._wiring.add_reader(resolved, self._local_receiver(port, row, channel, resolved, handler))
             return
