@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
@@ -12,7 +13,7 @@ pytest.importorskip("rclpy")
 from perch_core.component import Component, Input, ports  # noqa: E402
 from perch_core.ros.intake import TAKE_MAX, Intake  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
-from perch_core.values import Serialized, Transform  # noqa: E402
+from perch_core.values import NANOSECONDS, InertialState, Serialized, Transform  # noqa: E402
 
 
 class Listening(Component[None]):
@@ -54,6 +55,14 @@ def host() -> SimpleNamespace:
 
 def test_transforms_of_other_processes_are_taken_in_a_namespace_too(host):
     assert host.subscribed == ["/tf_static"] and host.intake.private == {"/quad1/vio/state"}
+
+
+def test_a_neighbours_value_without_a_message_is_dropped_and_the_next_one_is_taken(host):
+    publication = SimpleNamespace(observed=False, frequent=True, send=lambda _: None)
+    for size in (2, 3):  # of the position
+        state = InertialState(NANOSECONDS, np.zeros(size), np.array([0.0, 0.0, 0.0, 1.0]), *np.zeros((3, 3)), np.eye(15))
+        host.wiring.emit("/quad1/vio/state", publication, state)
+    assert [message.stamp for message in host.component.taken] == [NANOSECONDS] and len(host.failures) == 1
 
 
 class Flooded(nullcontext):
