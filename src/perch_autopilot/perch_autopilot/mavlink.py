@@ -11,7 +11,7 @@ If commands stop, set points stop, and the autopilot's own failsafe for their lo
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, nan
 from typing import Any
 
@@ -220,13 +220,10 @@ class Mavlink(Component[MavlinkParameters]):
             return b""
 
     def _on_link_lost(self, error: LinkError) -> None:
-        """Close a link that has ended, and reset all state but the autopilot's type, parameters and arming."""
+        """Close a link that has ended, and forget what only a link tells or has been told: presence, mode, set points, requests."""
         self.log(LogLine("error", str(error), 1.0))
         self.close()
-        before = self.offboard
-        self.offboard = Offboard(before.autopilot, before.armed, options=before.options, angle_boost=before.angle_boost,
-                                 arming=before.arming, forced=before.forced, commanding=before.commanding,
-                                 _disarm_until=before._disarm_until)
+        self.offboard = replace(self.offboard, following=False, _last_heartbeat=-1e9, _streaming_since=None, _last_request=-1e9)
         self._clock, self._last_sample = ClockOffset(), None
 
     def _send_command(self, command: int, *words: float) -> None:
