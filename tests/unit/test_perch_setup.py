@@ -321,6 +321,20 @@ def test_an_environment_that_is_killed_at_any_step_is_made_anew(environment, mon
     assert not virtualenv.usable()
 
 
+@pytest.mark.parametrize("lines, kept", [(["Collecting numpy==1"], True), (["Collecting numpy==1", "Installing collected packages: numpy"], False)])
+def test_an_environment_is_kept_where_its_new_packages_cannot_be_fetched(environment, monkeypatch, lines, kept):
+    """Without network a checkout goes on with the commit before; what a failure has changed is made anew."""
+    def run(self, command, name, variables, describe):
+        for line in lines:
+            describe(line)
+        raise SetupError("no network", 1)
+
+    monkeypatch.setattr(progress.Step, "run", run)
+    with pytest.raises(SetupError, match="no network"):
+        virtualenv.install(WHEELS, fresh=False)
+    assert virtualenv.usable() is kept
+
+
 @pytest.fixture
 def pip(environment, tmp_path, monkeypatch) -> list[list[str]]:
     """The command lines of pip, which does nothing."""
