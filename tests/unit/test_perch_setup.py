@@ -170,20 +170,32 @@ def test_a_domain_that_ros_cannot_have_is_refused(monkeypatch, domain):
     assert error.value.exit_code == 2
 
 
+def sourced(folder: Path, wheels: bool, **variables: str) -> subprocess.CompletedProcess[str]:
+    """`setup.bash` sourced in a set-up folder, which prints the range of discovery."""
+    shutil.copy(ROOT / "setup.bash", folder)
+    for file in (".venv/bin/activate", "install/setup.bash", *[".venv/share/rclpy/package.xml"] * wheels):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    return subprocess.run(["bash", "--norc", "-c", 'source "$1/setup.bash" && echo "$ROS_AUTOMATIC_DISCOVERY_RANGE"', "bash", str(folder)],
+                          env={"PATH": os.environ["PATH"], **variables}, capture_output=True, text=True)
+
+
 @pytest.mark.parametrize("wheels", [True, False])
 @pytest.mark.parametrize("middleware, limit", [("", "SUBNET"), ("rmw_fastrtps_cpp", "SUBNET"), ("rmw_cyclonedds_cpp", "LOCALHOST")])
 def test_another_middleware_is_refused_where_there_is_none_and_else_does_not_search_the_network(tmp_path, wheels, middleware, limit):
     """The address of `config/fastdds.xml` is a setting of Fast DDS."""
-    shutil.copy(ROOT / "setup.bash", tmp_path)
-    for file in (".venv/bin/activate", "install/setup.bash", *[".venv/share/rclpy/package.xml"] * wheels):
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / file).touch()
-    done = subprocess.run(["bash", "--norc", "-c", 'source "$1/setup.bash" && echo "$ROS_AUTOMATIC_DISCOVERY_RANGE"', "bash", str(tmp_path)],
-                          env={"PATH": os.environ["PATH"], "RMW_IMPLEMENTATION": middleware}, capture_output=True, text=True)
+    done = sourced(tmp_path, wheels, RMW_IMPLEMENTATION=middleware)
     if wheels and limit == "LOCALHOST":
         assert done.returncode == 1 and "the ROS wheels have rmw_fastrtps_cpp only: run   unset RMW_IMPLEMENTATION" in done.stderr
     else:
         assert (done.returncode, done.stdout) == (0, f"{limit}\n"), done.stderr
+
+
+@pytest.mark.parametrize("address, good", [
+    ("", True), ("10.0.0.255", True), ("127.0.0.1.", False), ("127.0.0", False), ("256.0.0.1", False), ("localhost", False)])
+def test_an_address_that_fast_dds_cannot_read_is_refused(tmp_path, address, good):
+    done = sourced(tmp_path, True, PERCH_NETWORK=address)
+    assert done.returncode == (not good) and ("is not an address such as 127.0.0.1" in done.stderr) is not good
 
 
 # -- the locks -------------------------------------------------------------------------------------------------------
