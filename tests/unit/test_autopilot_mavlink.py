@@ -250,6 +250,17 @@ def test_commands_leave_in_the_axes_of_aviation_and_never_stale(autopilot):
     assert autopilot.heard()["SET_ATTITUDE_TARGET"].thrust == 0.0
 
 
+def test_a_command_is_not_held_for_ever_where_the_hosts_clock_stands_still(autopilot):
+    """With `use_sim_time` and no /clock, the time of all polls is the same."""
+    autopilot.say(autopilot.mavlink.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
+    autopilot.heard()
+    autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+    for _ in range(50):
+        autopilot.node.on_poll(autopilot.now)
+    sent = [message.get_type() for message in autopilot.mavlink.parse_buffer(autopilot.link.recv(1 << 20))]
+    assert sent.count("SET_ATTITUDE_TARGET") == 20  # for 0.1 s
+
+
 def test_odometry_leaves_as_ned_with_its_covariance(autopilot):
     P = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     autopilot.node.on_odometry(OdometryState(SECOND, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (4.0, 5.0, 6.0), (0.1, 0.2, 0.3), P, P))

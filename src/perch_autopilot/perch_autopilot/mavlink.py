@@ -30,7 +30,9 @@ from perch_autopilot.rates import commanded_vehicle
 
 _HANDSHAKE = 3.0                     # for the autopilot's first heartbeat, which come once a second [s]
 _JUMP_SAMPLES = 3                    # samples in a row that do not follow the last one: its clock has jumped
+_POLL = 0.005                        # [s]
 _HELD = 100_000_000                  # rates and thrust that are older are not sent any more [ns]
+_HELD_POLLS = round(_HELD / (_POLL * NANOSECONDS))  # ... or after so many polls: the host's clock may stand still (use_sim_time)
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
 _SET_MODE, _ARM_DISARM, _SET_INTERVAL = 176, 400, 511  # MAV_CMD_DO_SET_MODE, MAV_CMD_COMPONENT_ARM_DISARM, MAV_CMD_SET_MESSAGE_INTERVAL
 _HIGHRES_IMU, _IMU_RATE = 105, 200   # its message id; rate that is requested: autopilots send it at 50 Hz or not at all by default [Hz]
@@ -62,7 +64,7 @@ class Mavlink(Component[MavlinkParameters]):
     rates_thrust = Input(RatesThrust, "rates_thrust_command")
     command = Input(ControllerCommand, "controller/command")
     odometry = Input(OdometryState, "odometry")
-    poll = Timer(0.005, stamping=True)
+    poll = Timer(_POLL, stamping=True)
     imu = Output(ImuSample, "imu/data_raw")
     rotors = Output(RotorState, "rotor_state")
 
@@ -88,7 +90,7 @@ class Mavlink(Component[MavlinkParameters]):
         self._command: RatesThrust | None = None
         self._now: int | None = None         # of the last poll [ns]
         self._start_time = self._command_time = self._last_heartbeat = self._last_rotors = self._opened = self._jumps = 0
-        self._corrupt_frames = self._reported_frames = 0
+        self._corrupt_frames = self._reported_frames = self._held_polls = 0
         self._last_odometry: int | None = None  # stamp of the last odometry that was sent [ns]
         self._samples = 0                       # of the IMU that have come since the last heartbeat to the autopilot
         self._last_sample: int | None = None    # stamp of the autopilot's last sample, by its own clock [ns]
@@ -113,7 +115,7 @@ class Mavlink(Component[MavlinkParameters]):
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Store a command, which each poll sends until it is stale."""
-        self._command, self._command_time = command, self._now or 0
+        self._command, self._command_time, self._held_polls = command, self._now or 0, 0
         self.offboard.arming.command((self._now or 0) * 1e-9, command.armed)
 
     def on_command(self, command: ControllerCommand) -> None:
@@ -166,7 +168,8 @@ class Mavlink(Component[MavlinkParameters]):
             self._handle_message(message, now)
         self._report_standing_rotors(now)
         command = self._command if self.offboard.takes_thrust else None
-        if command is not None and not 0 <= now - self._command_time <= _HELD:
+        self._held_polls += 1
+        if command is not None and not (0 <= now - self._command_time <= _HELD and self._held_polls <= _HELD_POLLS):
             command = None
         if command is not None and not self.offboard.obeys(command.armed):
             stop = self.offboard.arming.stop
