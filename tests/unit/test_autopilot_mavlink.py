@@ -423,6 +423,7 @@ def test_kill_stops_the_motors_also_where_no_controller_commands(autopilot):
 
     assert sent(Command.LAND, autopilot.now) is None
     assert sent(Command.KILL, autopilot.now - 2 * SECOND) is None
+    assert any("is too old: ignored" in line.text for line in autopilot.got["log"])
     assert sent(Command.KILL, autopilot.now) == sent(Command.KILL, 0) == (400, 0.0, 21196.0)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
-from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust, RotorState
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust, RotorState, seconds
 from perch_autopilot import frames
 from perch_autopilot.arming import Stop
 from perch_autopilot.clock import MAX_STEP, ClockOffset, clock_jump
@@ -119,11 +119,15 @@ class Mavlink(Component[MavlinkParameters]):
         self.offboard.arming.command((self._now or 0) * 1e-9, command.armed)
 
     def on_command(self, command: ControllerCommand) -> None:
-        """Stop the motors on KILL in any mode and at any height, also where no controller is there to obey it, or a frame is lost."""
-        if command.command == Command.KILL and not command.is_stale(self._now or 0):
-            self._command = None
-            self.offboard.kill((self._now or 0) * 1e-9)
-            self._send_command(_ARM_DISARM, 0.0, _FORCED)
+        """Stop the motors on KILL, unless it is stale, in any mode and at any height, also without a controller, or where a frame is lost."""
+        if command.command != Command.KILL:
+            return
+        if command.is_stale(self._now or 0):
+            self.warn(f"KILL of {seconds(command.stamp):.3f} s is too old: ignored; one with the stamp 0 never is")
+            return
+        self._command = None
+        self.offboard.kill((self._now or 0) * 1e-9)
+        self._send_command(_ARM_DISARM, 0.0, _FORCED)
 
     def on_odometry(self, state: OdometryState) -> None:
         """Send odometry to the autopilot's own estimator, in its axes, stamped by the host's clock (TIMESYNC); 50 Hz at most."""
