@@ -2,10 +2,11 @@
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
-from perch_core.sensors import ImuSensor, load_sensors
+from perch_core.sensors import CameraSensor, ImuSensor, Sensors, load_sensors
 from perch_core.values import CameraImage
 from perch_eval.recordings import check as checks
 from perch_eval.recordings import sensors_command
@@ -90,7 +91,6 @@ def test_what_is_wrong_is_named(heard, changes, about, level):
 
 
 def test_blur_is_seen(heard):
-    cv2 = pytest.importorskip("cv2")
     found = spoilt(heard, image=pixels(lambda p: cv2.GaussianBlur(p, (0, 0), 4.0)))
     assert found.get("camera cam0 sharpness") == "warning"
 
@@ -246,6 +246,22 @@ def test_stamps_that_are_none_fail():
         statistics.add(CameraImage(0, "c", 64, 48, "mono8", np.zeros((48, 64), np.uint8)))
     checks.check_camera(report, "cam0", statistics, stamps, None)
     assert any("does not stamp" in finding.text for finding in report.findings)
+
+
+def test_image_files_that_are_missing_or_damaged_are_counted(tmp_path):
+    data = tmp_path / "cam0" / "data"
+    data.mkdir(parents=True)
+    (tmp_path / "cam0" / "data.csv").write_text("".join(f"{10**9 + 10**8 * k},{k}.png\n" for k in range(12)))
+    for k in range(12):
+        cv2.imwrite(str(data / f"{k}.png"), np.full((48, 64), 9 * k, np.uint8))
+    (data / "3.png").unlink()
+    (data / "5.png").write_bytes(b"broken off")
+    sensors = Sensors(name="mine", cameras={"cam0": CameraSensor(model="pinhole", width=64, height=48, focal=(60.0, 60.0), centre=(32.0, 24.0))})
+    for calibration, count in ((None, 2), (sensors, 1)):
+        found = {f.about: f for f in check(open_recording(tmp_path, calibration)).findings}
+        assert f"{count} of 12 image files are missing" in found["recording"].text and found["recording"].level == "warning"
+        assert found["recording"].text.endswith("3.png")
+    assert found["camera cam0 files"] == ("warning", "camera cam0 files", "1 of 11 sampled images could not be decoded")
 
 
 @pytest.mark.parametrize("late, level", [(20_000_000, "ok"), (-5_000_000, "warning"), (600_000_000, "warning")])
