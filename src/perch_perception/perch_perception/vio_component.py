@@ -95,7 +95,11 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         if taken is None:
             return
         if self._intake.restarted:
+            elsewhere = self._vio.has_left_start_before(taken.stamp)
             self._begin()
+            if elsewhere:
+                self._vio.forget_start(taken.stamp)
+                self.warn("imu/data_raw: stamps jumped ahead after the vehicle had left its start: position and heading are unknown", 0.0)
             self.clear_queue()
         outcome = self._vio.add_imu(taken)
         if outcome is not ImuOutcome.USED:
