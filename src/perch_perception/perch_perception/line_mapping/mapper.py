@@ -48,7 +48,7 @@ class _Track:
     count: int = 1
     estimate: WireEstimate | None = None
     extent: tuple[float, float] | None = None
-    refusal: str = ""
+    refusal: str = "seen from one place only: move across the wire"
     attached: int = 0  # images that show it to be attached to what is beside it, less those that show it apart
 
 
