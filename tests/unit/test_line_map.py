@@ -183,6 +183,16 @@ def test_false_sightings_are_forgotten():
     assert mapper._tracks == []
 
 
+def test_a_wire_of_two_sightings_is_forgotten_though_it_was_triangulated():
+    mapper, wire = LineMapper(MapperConfig()), WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0]))
+    body = BodyState(0.0, np.array([0, 0, 2.0]), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3))
+    for k, height in enumerate((1.87, 2.12)):
+        mapper.update(0.1 * k, body, [observe(np.random.default_rng(9), wire, np.array([0.0, 0.0, height]), time=0.1 * k)])
+    assert [track.estimate is not None for track in mapper._tracks] == [True]
+    mapper.update(2.2, body, [])
+    assert mapper._tracks == []
+
+
 def test_the_map_follows_an_odometry_that_drifts():
     """What the newest sightings say counts more than what the oldest did: the vehicle will fly there from where it is now."""
     wire, errors = WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0])), {}
