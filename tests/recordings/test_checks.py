@@ -264,6 +264,14 @@ def test_image_files_that_are_missing_or_damaged_are_counted(tmp_path):
     assert found["camera cam0 files"] == ("warning", "camera cam0 files", "1 of 11 sampled images could not be decoded")
 
 
+@pytest.mark.parametrize("stamp", ["now", "\u00b2", "9" * 25])
+def test_stamps_of_images_that_are_no_nanoseconds_are_refused(tmp_path, stamp):
+    (tmp_path / "cam0").mkdir()
+    (tmp_path / "cam0" / "data.csv").write_text(f"{stamp},a.png\n")
+    with pytest.raises(RecordingError, match="is no stamp in nanoseconds"):
+        open_recording(tmp_path, None)
+
+
 @pytest.mark.parametrize("late, level", [(20_000_000, "ok"), (-5_000_000, "warning"), (600_000_000, "warning")])
 def test_how_long_after_their_stamps_images_were_recorded_is_said(late, level):
     report, statistics = Report(), checks.ImageStatistics(20)

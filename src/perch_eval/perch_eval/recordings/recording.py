@@ -238,7 +238,7 @@ def _frames(path: Path) -> list[tuple[int, str]]:
     rows = []
     for line in rows_of(path):
         stamp, _, name = line.partition(",")
-        if not stamp.strip().isdigit():
+        if not stamp.strip().isdecimal() or int(stamp) > np.iinfo(np.int64).max:
             raise RecordingError(f"{path}: {stamp[:40]!r} is no stamp in nanoseconds")
         rows.append((int(stamp), name.strip() or f"{stamp.strip()}.png"))
     return rows
