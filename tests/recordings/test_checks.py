@@ -75,6 +75,7 @@ def test_nothing_is_wrong_with_a_good_one(heard):
     (dict(imu=times(1 / 9.81)), "imu units", "fails"),
     (dict(imu=times(0.0)), "imu units", "fails"),
     (dict(imu=lambda k, s: s._replace(w_B=(3000.0, 0.0, 40.0))), "imu units", "fails"),
+    (dict(imu=lambda k, s: s._replace(w_B=(np.nan, 0.0, 0.0)) if k % 100 == 0 else s), "imu values", "fails"),
     (dict(imu=lambda k, s: None if 500 < k < 530 else s), "imu gaps", "warning"),
     (dict(imu=lambda k, s: s._replace(stamp=s.stamp - 4_500_000 * (k % 2))), "imu jitter", "warning"),
     (dict(imu=lambda k, s: s if k % 5 == 0 else None), "imu rate", "fails"),

@@ -63,8 +63,11 @@ def check(recording: Recording, events: Iterator[Event] | None = None) -> Report
         check_camera(report, name, statistics, times, sensors)
     if sensors is None:
         report.add("calibration", "none: give --sensors FILE, made by `sensors.py import`", warning=True)
-    elif len(times) > 10 and np.ptp(times) > 0 and sensors.imu is not None:
-        check_clocks(report, recording, times, imu, sensors, sensors.imu.R_BI)
+    elif sensors.imu is not None:
+        good = np.isfinite(imu).all(axis=1)
+        times, first = np.unique(times[good], return_index=True)
+        if len(times) > 10:
+            check_clocks(report, recording, times, imu[good][first], sensors, sensors.imu.R_BI)
     return report
 
 
