@@ -89,6 +89,8 @@ class StateEstimator(Component[EstimatorConfig]):
         outcome = self.filter.add_imu(taken)
         if outcome is not ImuOutcome.USED:
             self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
+        if outcome is ImuOutcome.GAP:
+            self._covariance_age = COVARIANCE_STRIDE
         motion = self.filter.motion
         if motion is not None:
             self._emit(sample.stamp, motion)
