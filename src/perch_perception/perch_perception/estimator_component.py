@@ -130,7 +130,7 @@ class StateEstimator(Component[EstimatorConfig]):
                 self.warn(f"{channel}: {error}: not used", 1.0)
                 continue
             outcome = self.filter.add_vio(pose)
-            if not is_odometry and (outcome.used or outcome is VioOutcome.DUPLICATE):
+            if not is_odometry and (outcome.used or outcome in (VioOutcome.DUPLICATE, VioOutcome.WAITING)):
                 self._newest_state = stamp
             self._covariance_age = COVARIANCE_STRIDE
             if outcome not in (VioOutcome.STARTED, VioOutcome.APPLIED, VioOutcome.WAITING, VioOutcome.NO_IMU):
