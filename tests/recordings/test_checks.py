@@ -1,5 +1,6 @@
 """`scripts/sensors.py check`: what would make perception fail is named, and what is well is not."""
 
+import itertools
 from types import SimpleNamespace
 
 import cv2
@@ -12,7 +13,7 @@ from perch_eval.recordings import check as checks
 from perch_eval.recordings import sensors_command
 from perch_eval.recordings.check import check
 from perch_eval.recordings.imu_check import Report, allan_deviation, check_estimated_biases, check_imu, check_rate, stretches_at_rest
-from perch_eval.recordings.opening import open_recording
+from perch_eval.recordings.opening import BagRecording, open_recording
 from perch_eval.recordings.recording import IMU, Recording, RecordingError
 from perch_eval.recordings.trajectory import Trajectory, evaluate, read_trajectory, write_tum
 from recordings import photo_flight
@@ -247,6 +248,20 @@ def test_stamps_that_are_none_fail():
         statistics.add(CameraImage(0, "c", 64, 48, "mono8", np.zeros((48, 64), np.uint8)))
     checks.check_camera(report, "cam0", statistics, stamps, None)
     assert any("does not stamp" in finding.text for finding in report.findings)
+
+
+def test_messages_that_cannot_be_used_are_counted_whatever_the_reasons_quote(files, monkeypatch):
+    recording, convert, sizes = open_recording(files / "sqlite3", load_sensors(files / "mine.yaml")), BagRecording._value, itertools.count()
+
+    def value(self, source, connection, message):
+        if source != IMU:
+            raise RecordingError(f"compressed image: {next(sizes)} bytes are no JPEG")
+        return convert(self, source, connection, message)
+
+    monkeypatch.setattr(BagRecording, "_value", value)
+    assert len(list(recording.events())) == recording.samples
+    n = recording.images["cam0"]
+    assert n > 50 and recording.damage.startswith(f"{n} of {n} messages of ") and "are no JPEG" in recording.damage
 
 
 def test_image_files_that_are_missing_or_damaged_are_counted(tmp_path):
