@@ -187,6 +187,15 @@ def test_a_vehicle_that_was_started_again_is_followed(shift):
     assert last.stamp > shift and again.error(last, shift)[0] < 0.05
 
 
+def test_stamps_that_jump_ahead_in_flight_leave_position_and_heading_unknown():
+    flight = climbing()
+    for sample in flight.samples[:12]:
+        flight.component.on_imu(sample._replace(stamp=sample.stamp + 3 * 10**9))
+    known = flight.component._vio._last_pose.present()
+    assert known.covariance[0, 0] > 100.0**2 and known.covariance[3, 3] > 1.0
+    assert any("position and heading are unknown" in text for text in flight.out.warnings())
+
+
 @pytest.mark.parametrize(("step", "again"), [(30, 0), (100, 0), (0, 10), (0, 50)])
 def test_a_clock_that_is_set_back_a_little_and_samples_delivered_again_discard_nothing(step, again):
     """In flight. A step of 100 ms hides so much motion that vision may no longer fit: then VIO goes on from its last pose."""
