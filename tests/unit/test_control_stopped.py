@@ -171,6 +171,20 @@ def test_a_stop_at_the_geofence_is_not_undone_by_a_plan_that_waits():
     assert [e[2] for e in loop.events[1:]] == ["tracking trajectory 7", "hover: 0.0 m outside the geofence"], loop.events
 
 
+def test_what_waits_when_a_flight_is_stopped_at_the_geofence_is_not_begun_from_another_place():
+    loop, start = leaving()
+    flight, (x, _, _) = loop.controller, loop.plant.p
+    later = along_x(start + 1.5, 0.6, 0.4, 1.0, brakes=True)
+    flight.follow(Order(8, SampledReference(later, flight.vehicle.mass), start + 1.5))
+    flight.use(flight.law, flight.gains, FlightSettings(fence_high=(x - 0.01, 20.0, 20.0)))
+    loop.run(0.02)
+    assert flight.state is State.HOVERING, loop.events
+    flight.use(flight.law, flight.gains, FlightSettings())  # a gust is over, the vehicle is back inside
+    loop.run(1.7)
+    assert flight.state is State.HOVERING and loop.plant.p[0] < 0.3, loop.events
+    assert "trajectory 8 was not started: it starts 0.4" in flight.flight_state.message
+
+
 def test_a_perch_may_begin_in_the_brake_at_the_end_of_a_move():
     loop = hovering_loop()
     p = loop.plant.p.copy()
