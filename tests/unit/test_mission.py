@@ -347,6 +347,16 @@ def test_the_time_limit_of_a_take_off_begins_after_a_long_way():
     assert world.outcome.result is Result.PERCHED
 
 
+def test_a_search_by_a_vehicle_that_does_not_come_to_rest_ends():
+    world = reached(Phase.SEARCHING)
+    world.machine._moves.slow = lambda state: False
+    began = world.time
+    while world.outcome is None and world.time < began + 60.0:
+        world.tick()
+    assert world.outcome.result is Result.TIMEOUT and "search hover not reached within" in world.outcome.message
+    assert world.commands[-1] is Command.LAND and world.time - began < world.machine.settings.phase_timeout + 1.0
+
+
 def test_a_cancel_at_the_take_off_holds_whether_or_not_it_has_begun():
     world = reached(Phase.ARMING)
     world.tick()

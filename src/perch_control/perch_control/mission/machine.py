@@ -244,15 +244,16 @@ class MissionMachine(ABC):
     # -- endings -----------------------------------------------------------------------------------------------------
 
     def _handle_fallback(self, inputs: Inputs, outputs: Outputs) -> bool:
-        """Whether the phase was left, as the controller recovers or descends, or as the take-off takes too long."""
+        """Whether the phase was left, as the controller recovers or descends, or as a move does not come to rest."""
         if inputs.controller is ControllerState.RECOVERING:
             self._fail_without_retry(inputs, f"controller recovers: {inputs.controller_message}")
             return True
         if self._handle_descent(inputs, outputs):
             return True
         limit = self._moves.length + self.settings.phase_timeout
-        if self.phase is Phase.TAKE_OFF and self._elapsed(inputs) > limit:
-            outputs.commands.append((Command.LAND, "take-off took too long"))
+        if (self.phase in (Phase.TAKE_OFF, Phase.SEARCHING) and inputs.time - self._moves.began > limit
+                and not self._moves.arrived(inputs.time, inputs.state)):
+            outputs.commands.append((Command.LAND, "search hover not reached"))
             self._end(outputs, Result.TIMEOUT, f"search hover not reached within {limit:.0f} s; landing")
             return True
         return False
