@@ -17,6 +17,7 @@ from perch_control.mission.values import Command, ControllerState, Goal, Inputs,
 
 SEARCH_RISE = 0.25              # height change of the search pattern [m]
 SEARCH_TURN = np.radians(30.0)  # its sweep [rad]
+ACCEPTANCE_TIMEOUT = 0.5  # a controller that still hovers so long after a trajectory's start has not accepted it [s]
 _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
 
 

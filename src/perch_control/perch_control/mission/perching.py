@@ -8,13 +8,12 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from perch_control.mission.machine import MissionMachine
+from perch_control.mission.machine import ACCEPTANCE_TIMEOUT, MissionMachine
 from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
 from perch_control.mission.ways_out import WaysOut
 
-PERCH_ACCEPTANCE_TIMEOUT = 0.5  # a controller that still hovers so long after a plan's start has not accepted it [s]
 REPLACED_TIMEOUT = 0.1    # a plan that is still flown so long after its successor's start has not been replaced [s]
 ATTACHED_RETRY = 0.1      # period of the command ATTACHED while the controller still flies although the vehicle is attached [s]
 _IN_FLIGHT = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerState.RECOVERING)
@@ -119,7 +118,7 @@ class PerchingMission(MissionMachine, Generic[R]):
         if inputs.controller is ControllerState.RECOVERING or hovers and inputs.trajectory_id >= self._first_id:
             self._fail_without_retry(inputs, f"perch given up: {inputs.controller_message}")
             return
-        if hovers and inputs.time > self._first_start + PERCH_ACCEPTANCE_TIMEOUT:
+        if hovers and inputs.time > self._first_start + ACCEPTANCE_TIMEOUT:
             outputs.commands.append((Command.HOVER, "the plan was not accepted"))  # and must not be later
             self._end(outputs, Result.REFUSED, f"the controller has not accepted the plan: {inputs.controller_message}")
             return
