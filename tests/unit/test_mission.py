@@ -263,6 +263,19 @@ def test_a_departure_whose_plan_is_not_flown_arms(answers, within, said):
     assert [command for command, _ in out.commands] == [Command.ARM] and time < within and machine.message.endswith(said)
 
 
+def test_a_landing_on_the_way_of_a_departure_ends_it_with_what_the_controller_says():
+    moves, query = Moves(MissionSettings()), None
+    moves.wire = WIRE
+    machine = Departure(MissionSettings(), moves=moves)
+    machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), 0.0)
+    for k, state in enumerate((ControllerState.ATTACHED, ControllerState.ATTACHED, ControllerState.TRACKING, ControllerState.LANDING)):
+        plan = Plan(rest_to_rest(np.zeros(3), np.ones(3), 0.0, 0.0, 1.0, k * TICK), 1.0) if query is not None else None
+        out = machine.tick(Inputs(k * TICK, State(SURFACE.p_WS, Q_PERCH, np.zeros(3), np.zeros(3)), True, state, "no odometry", 0, None,
+                                  np.zeros((0, 3)), plan))
+        query = out.query
+    assert out.outcome.result is Result.TRACKING_LOST and out.outcome.message == "controller descends: no odometry"
+
+
 def test_a_target_that_was_lost_has_to_be_in_view_for_as_long_again():
     world = reached(Phase.SEARCHING)
     while world.machine.message != "target in view":

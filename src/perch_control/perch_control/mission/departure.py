@@ -41,6 +41,8 @@ class Departure(MissionMachine):
             self._fail_attempt(inputs, "departing")
         elif inputs.controller is ControllerState.TRACKING and self._requested_at is not None:
             pass
+        elif self._requested_at is not None and self._handle_descent(inputs, outputs):
+            pass
         elif inputs.controller is not ControllerState.ATTACHED:
             self._end(outputs, Result.REFUSED, f"not perched: the controller is {inputs.controller.name.lower()}")
         elif self._elapsed(inputs) > self.settings.phase_timeout:
