@@ -228,6 +228,17 @@ def test_a_vehicle_that_comes_off_is_armed_until_the_controller_flies():
     assert world.outcome.result is Result.MISSED and world.controller is ControllerState.HOVERING
 
 
+def test_motors_that_were_started_because_the_vehicle_came_off_are_not_stopped_again():
+    world = reached(Phase.PERCHED)
+    world.tick()
+    world.machine._stopped_at, world.deaf = world.p + (0.0, 0.0, 0.3), 1  # it has slid
+    while world.machine.phase is Phase.PERCHED:
+        world.tick()
+    world.tick()
+    assert world.machine.phase is Phase.RECOVERING and world.controller is ControllerState.RECOVERING
+    assert Command.ATTACHED not in world.commands[2:]
+
+
 WIRE = Target(0.0, SURFACE.p_WS, Q_PERCH, 0.01, 0.01, (MappedPowerline(4, (1.7, -2.0, 1.2), (1.7, 2.0, 1.2), 0.01, 1e-4 * np.eye(3), 0.01, 30),), 4)
 
 

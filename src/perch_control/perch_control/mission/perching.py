@@ -80,8 +80,8 @@ class PerchingMission(MissionMachine, Generic[R]):
         """Act on a contact that was not detected."""
 
     def holds(self, inputs: Inputs) -> bool:
-        """Whether an abandoned perch holds the vehicle after all, as the contact or the abort was late."""
-        return (self._flown_id > 0 and -self.settings.contact_early < inputs.time - self._running.plan.end < 1.0
+        """Whether an abandoned perch holds the vehicle after all, as the contact or the abort was late; never after motors were started."""
+        return (self._flown_id > 0 and not self._detached and -self.settings.contact_early < inputs.time - self._running.plan.end < 1.0
                 and self._adhesion.is_conclusive(inputs.state) and self._adhesion.attached(inputs.state, self._running.target))
 
     # -- phases ------------------------------------------------------------------------------------------------------
