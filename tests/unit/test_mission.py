@@ -73,7 +73,8 @@ class World:
             if command is Command.ARM and self.deaf:
                 self.deaf -= 1
             elif command is Command.ARM and self.controller is ControllerState.ATTACHED:
-                self.controller, self.hover_at = ControllerState.RECOVERING, self.time + 1.0
+                self.controller, self.hover_at, self.perch_end = ControllerState.RECOVERING, self.time + 1.0, None
+                self.q, self.off_at = np.array([0.0, 0.0, 0.0, 1.0]), None
             elif command is Command.ARM:
                 self.controller = ControllerState.ARMED
             elif command is Command.HOVER and self.controller is not ControllerState.ATTACHED:
@@ -224,8 +225,20 @@ def test_a_vehicle_that_comes_off_is_armed_until_the_controller_flies():
     world.deaf = 3
     while world.outcome is None:
         world.tick()
-    assert world.commands == [Command.ARM, Command.ATTACHED] + 4 * [Command.ARM, Command.HOVER]
+    assert world.commands == [Command.ARM, Command.ATTACHED, Command.ARM, Command.HOVER] + 3 * [Command.ARM]
     assert world.outcome.result is Result.MISSED and world.controller is ControllerState.HOVERING
+
+
+def test_a_vehicle_that_cannot_be_armed_after_it_came_off_ends_the_goal_with_the_reason():
+    world = World(stays=False)
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    while world.machine.phase is not Phase.PERCHED:
+        world.tick()
+    world.deaf = 10_000
+    while world.outcome is None:
+        world.tick()
+    assert world.outcome.result is Result.TRACKING_LOST and "(says so)" in world.outcome.message
+    assert world.commands.count(Command.HOVER) == 1
 
 
 def test_motors_that_were_started_because_the_vehicle_came_off_are_not_stopped_again():

@@ -212,7 +212,8 @@ class MissionMachine(ABC):
             self._end(outputs, result, f"{self._failure}; {inputs.controller_message if landing else 'on the ground'}")
         elif self._elapsed(inputs) > self.settings.phase_timeout:
             outputs.commands.append((Command.LAND, "recovery took too long"))
-            self._end(outputs, Result.TRACKING_LOST, f"{self._failure}; no hover within {self.settings.phase_timeout:g} s, landing")
+            why = f"no hover within {self.settings.phase_timeout:g} s ({inputs.controller_message}), landing was commanded"
+            self._end(outputs, Result.TRACKING_LOST, f"{self._failure}; {why}")
         elif resting and self._elapsed(inputs) > self.settings.settle_time:
             self._recovered(inputs, outputs)
 

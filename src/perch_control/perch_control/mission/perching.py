@@ -153,7 +153,7 @@ class PerchingMission(MissionMachine, Generic[R]):
         rested, attached = self._elapsed(inputs) > self.settings.rest_time, inputs.controller is ControllerState.ATTACHED
         if self._adhesion.detached(inputs.state) or rested and attached and not self._adhesion.rests(inputs.state, self._stopped_at):
             self._detached = True
-            self._start_motors(outputs)
+            outputs.commands += [(Command.ARM, "came off the surface"), (Command.HOVER, "came off the surface")]
             self._fail_attempt(inputs, "came off the surface after the motors stopped")
         elif rested and not attached:
             self._end(outputs, Result.TRACKING_LOST, f"the controller is not attached: {inputs.controller_message}")
@@ -167,14 +167,10 @@ class PerchingMission(MissionMachine, Generic[R]):
             self._attached_sent_at = inputs.time
             outputs.commands.append((Command.ATTACHED, "repeated"))  # the first command was lost
 
-    def _start_motors(self, outputs: Outputs) -> None:
-        """Start the motors and hover: the vehicle has come off."""
-        outputs.commands += [(Command.ARM, "came off the surface"), (Command.HOVER, "came off the surface")]
-
     def _recovering(self, inputs: Inputs, outputs: Outputs) -> None:
         super()._recovering(inputs, outputs)
         if self._detached and self.phase is Phase.RECOVERING and inputs.controller is ControllerState.ATTACHED:
-            self._start_motors(outputs)  # the commands before were lost, or refused for a moment
+            outputs.commands.append((Command.ARM, "came off the surface"))  # the command before was lost, or refused for a moment
 
     def _enter(self, phase: Phase, time: float, message: str) -> None:
         super()._enter(phase, time, message)
