@@ -524,11 +524,13 @@ def test_cancelled_when_no_way_out_is_left_a_surface_is_the_goals_end():
 
 
 PATH = rest_to_rest(np.zeros(3), SURFACE.p_WS, 0.0, 0.0, 3.0, start_time=20.0)
+NOWHERE = SampledTrajectory(np.array([0.0, 3.0]), *(np.zeros((2, width)) for width in (3, 4, 3, 3, 3, 3, 4)), start_time=20.0)
 
 
 @pytest.mark.parametrize("changes, word", [
     ({"at_end": 7}, "at_end: 7 is outside"), ({"perch_time": NAN}, "perch after nan s"), ({"perch_time": 1e9}, "perch after 1e+09 s"),
-    ({"recovery_start": math.inf}, "recovery_start"), ({"trajectory": PATH}, "trajectory: polynomials")])
+    ({"recovery_start": math.inf}, "recovery_start"), ({"trajectory": PATH}, "trajectory: polynomials"),
+    ({"trajectory": NOWHERE}, "quaternion of sample 0 has norm 0.0000")])
 def test_an_invalid_plan_is_refused_with_the_reason(changes, word):
     world = Wires()
     world.changes = changes
