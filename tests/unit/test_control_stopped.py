@@ -72,6 +72,20 @@ def test_a_command_that_is_repeated_brakes_like_one_that_is_given_once(command, 
     np.testing.assert_allclose(stops[0], stops[1], atol=0.02)
 
 
+@pytest.mark.parametrize("order", [lambda flight: flight.order(Command.HOVER), abort])
+def test_a_hover_that_is_ordered_again_is_not_one_without_orders(order):
+    flight = hovering()
+    flight.component.reconfigure(replace(flight.component.config, flight=FlightSettings(silence_time=0.3)))
+    p = flight.plant.p.copy()
+    for _ in range(3):
+        order(flight)
+        flight.step(0.2)
+        assert flight.state is State.HOVERING, flight.said
+    assert np.linalg.norm(flight.plant.p - p) < 0.02
+    flight.step(0.2)
+    assert flight.state is State.LANDING and "no order for" in flight.component.flight.flight_state.message
+
+
 def test_what_waited_when_the_motors_were_stopped_is_not_flown_when_they_run_again():
     flight = Flight()
     flight.step(0.2)
