@@ -142,6 +142,17 @@ def test_feedback_comes_at_changes_and_every_tenth_of_a_second():
     assert 10 <= len(world.goal.told) <= 14
 
 
+def test_a_vehicle_that_may_be_on_its_perch_is_not_armed_before_the_controller_has_said_so():
+    world = World()
+    world.state, receive = ControllerState.ATTACHED, world.mission.on_status
+    world.mission.on_status = lambda status: None
+    world.send().run(0.1)
+    assert world.commands == [] and world.goal.told[-1].message == "waiting for the controller"
+    world.mission.on_status = receive
+    world.run(0.1)
+    assert world.commands == [] and world.goal.result.error_code == Result.PERCHED_ALREADY
+
+
 def test_a_second_goal_goes_on_with_other_numbers():
     world = World().send().run()
     world.goal, world.state, world.flown, world.contact, world.q, world.p = Sent(PerchGoal()), ControllerState.DISARMED, None, None, LEVEL, np.zeros(3)

@@ -154,6 +154,8 @@ class MissionMachine(ABC):
             outputs.commands.append((Command.DISARM, "arming took too long"))
             why = "the estimator is not ready" if not inputs.estimator_ready else inputs.controller_message
             self._end(outputs, Result.TIMEOUT, f"not armed within {self.settings.arming_timeout:g} s: {why}")
+        elif inputs.estimator_ready and inputs.controller_time == -np.inf:  # it may be attached: ARM would start it from its perch
+            self.message = "waiting for the controller"
         elif inputs.estimator_ready and self._should_request_arm(inputs):
             outputs.commands.append((Command.ARM, "goal accepted"))
             self.message = "arming"
