@@ -287,6 +287,16 @@ def test_a_departure_whose_plan_is_not_flown_arms(answers, within, said):
     assert [command for command, _ in out.commands] == [Command.ARM] and time < within and machine.message.endswith(said)
 
 
+def test_a_departure_waits_until_the_state_of_the_controller_is_known():
+    machine, out = Departure(MissionSettings()), Outputs()
+    machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), 0.0)
+    for k, (state, known) in enumerate(((ControllerState.DISARMED, -np.inf), (ControllerState.ATTACHED, 0.02))):
+        assert out.outcome is None and not out.commands
+        out = machine.tick(Inputs(k * TICK, State(SURFACE.p_WS, Q_PERCH, np.zeros(3), np.zeros(3)), True, state, "says so", 0, None,
+                                  np.zeros((0, 3)), controller_time=known))
+    assert [command for command, _ in out.commands] == [Command.ARM]
+
+
 def test_a_landing_on_the_way_of_a_departure_ends_it_with_what_the_controller_says():
     moves, query = Moves(MissionSettings()), None
     moves.wire = WIRE
