@@ -199,6 +199,16 @@ def test_what_waits_when_a_flight_is_stopped_at_the_geofence_is_not_begun_from_a
     assert "trajectory 8 was not started: it starts 0.4" in flight.flight_state.message
 
 
+def test_a_take_off_outside_the_geofence_is_a_landing():
+    flight = Flight()
+    flight.component.reconfigure(replace(flight.component.config, flight=FlightSettings(fence_high=(-0.5, 20.0, 20.0))))
+    flight.step(0.5)
+    flight.order(Command.ARM)
+    flight.follow(flight.path((0, 0, 0), (0, 0, 0.6), 1.0))
+    flight.step(2.5)
+    assert flight.state is State.DISARMED and flight.plant.p[2] < 0.05 and "landing: 0.5 m outside the geofence" in flight.said
+
+
 def test_a_perch_may_begin_in_the_brake_at_the_end_of_a_move():
     loop = hovering_loop()
     p = loop.plant.p.copy()
