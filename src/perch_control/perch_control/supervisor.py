@@ -117,7 +117,8 @@ class Supervisor:
         if outside > _FENCE_SLACK:
             return landing(x, f"landing: {outside:.1f} m outside the geofence", speed)
         if outside > 0.0 and x.mode is State.TRACKING and not committed(x):
-            return stopped(x, f"hover: {outside:.1f} m outside the geofence")
+            where = f"{outside:.1f} m outside the geofence"
+            return landing(x, f"landing: {where}", speed) if x.low else stopped(x, f"hover: {where}")
         if self._monitor.exhausted(x.margin, x.now):
             return landing(x, "landing: the rotors are at their limit", speed)
         if x.order is not None:
