@@ -209,6 +209,16 @@ def test_a_take_off_outside_the_geofence_is_a_landing():
     assert flight.state is State.DISARMED and flight.plant.p[2] < 0.05 and "landing: 0.5 m outside the geofence" in flight.said
 
 
+def test_a_tilted_vehicle_recovers_before_it_lands_outside_the_geofence():
+    loop, _ = leaving()
+    flight = loop.controller
+    flight.use(flight.law, flight.gains, FlightSettings(fence_high=(loop.plant.p[0] - 0.01, 20.0, 20.0)))
+    level = flight.flight_state._replace(ground=flight.flight_state.state_estimate[2])
+    assert flight.supervisor.act(level, False).mode is State.LANDING
+    tilted = level._replace(state_estimate=(*level.state_estimate[:6], 0.0, 0.5, 0.0, 0.75**0.5, 0.0, 0.0, 0.0))
+    assert flight.supervisor.act(tilted, False).mode is State.RECOVERING
+
+
 def test_a_perch_may_begin_in_the_brake_at_the_end_of_a_move():
     loop = hovering_loop()
     p = loop.plant.p.copy()

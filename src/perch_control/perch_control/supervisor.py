@@ -118,7 +118,8 @@ class Supervisor:
             return landing(x, f"landing: {outside:.1f} m outside the geofence", speed)
         if outside > 0.0 and x.mode is State.TRACKING and not committed(x):
             where = f"{outside:.1f} m outside the geofence"
-            return landing(x, f"landing: {where}", speed) if x.low else stopped(x, f"hover: {where}")
+            after = stopped(x, f"hover: {where}")  # tilted or at a surface, the vehicle recovers first
+            return landing(x, f"landing: {where}", speed) if x.low and after.mode is State.HOVERING else after
         if self._monitor.exhausted(x.margin, x.now):
             return landing(x, "landing: the rotors are at their limit", speed)
         if x.order is not None:
