@@ -188,9 +188,11 @@ def test_a_vehicle_that_was_started_again_is_followed(shift):
 
 
 def test_stamps_that_jump_ahead_in_flight_leave_position_and_heading_unknown():
+    """Also where no sample after a first jump can be used."""
     flight = climbing()
-    for sample in flight.samples[:12]:
-        flight.component.on_imu(sample._replace(stamp=sample.stamp + 3 * 10**9))
+    for jump, gyro in ((3, (math.nan,) * 3), (6, (0.0,) * 3)):
+        for sample in flight.samples[:12]:
+            flight.component.on_imu(sample._replace(stamp=sample.stamp + jump * 10**9, w_B=gyro))
     known = flight.component._vio._last_pose.present()
     assert known.covariance[0, 0] > 100.0**2 and known.covariance[3, 3] > 1.0
     assert any("position and heading are unknown" in text for text in flight.out.warnings())
