@@ -151,6 +151,16 @@ def test_a_missing_imu_is_named():
     assert component.missing == ""
 
 
+def test_a_camera_without_images_is_named():
+    component = VioComponent(VioComponentConfig())
+    out = Outputs(component)
+    for k in range(201):
+        assert out["diagnostics"] == []
+        component.on_imu(ImuSample(10_000_000 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)))
+    last = out["diagnostics"][-1]
+    assert (last.level, last.message) == (1, "camera_down/image_raw: no image for 2 s") and last.message in out.warnings()
+
+
 @pytest.mark.parametrize("change", [dict(encoding="mono16"), dict(width=320), dict(pixels=np.zeros((480, 640), np.float32)),
                                     dict(pixels=lambda region: None)])
 def test_an_image_of_another_kind_is_refused(change):
