@@ -280,7 +280,7 @@ def test_image_files_that_are_missing_or_damaged_are_counted(tmp_path):
     assert found["camera cam0 files"] == ("warning", "camera cam0 files", "1 of 11 sampled images could not be decoded")
 
 
-@pytest.mark.parametrize("stamp", ["now", "\u00b2", "9" * 25])
+@pytest.mark.parametrize("stamp", ["now", "\u00b2", "9" * 19, "9" * 5000], ids=["word", "square", "beyond int64", "endless"])
 def test_stamps_of_images_that_are_no_nanoseconds_are_refused(tmp_path, stamp):
     (tmp_path / "cam0").mkdir()
     (tmp_path / "cam0" / "data.csv").write_text(f"{stamp},a.png\n")

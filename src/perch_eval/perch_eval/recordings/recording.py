@@ -238,9 +238,10 @@ def _frames(path: Path) -> list[tuple[int, str]]:
     rows = []
     for line in rows_of(path):
         stamp, _, name = line.partition(",")
-        if not stamp.strip().isdecimal() or int(stamp) > np.iinfo(np.int64).max:
+        digits = stamp.strip()
+        if not digits.isdecimal() or len(digits) > 19 or int(digits) > np.iinfo(np.int64).max:  # int() takes up to 4300 digits
             raise RecordingError(f"{path}: {stamp[:40]!r} is no stamp in nanoseconds")
-        rows.append((int(stamp), name.strip() or f"{stamp.strip()}.png"))
+        rows.append((int(digits), name.strip() or f"{digits}.png"))
     return rows
 
 

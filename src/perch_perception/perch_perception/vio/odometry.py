@@ -113,7 +113,8 @@ class VisualInertialOdometry:
 
     def has_left_start_before(self, stamp: int) -> bool:
         """Whether the vehicle has left the configured start, by samples that all precede a stamp [ns]."""
-        return not self._at_configured_start and self._imu.newest.stamp < stamp
+        last = self._imu.last  # None: no sample since `forget_start` could be used
+        return not self._at_configured_start and (last is None or last.stamp < stamp)
 
     def forget_start(self, stamp: int) -> None:
         """Take position and heading for unknown, of a vehicle that may be in motion at a stamp [ns]; call it before the first sample."""
