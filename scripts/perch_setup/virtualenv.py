@@ -88,9 +88,9 @@ def usable() -> bool:
 
 
 def _environment(target: Platform) -> dict[str, str]:
-    """Return the caller's environment without variables that interfere with pip."""
+    """Return the caller's environment without variables that interfere with pip, whose output is read."""
     environment = {key: value for key, value in os.environ.items() if key not in _USER_SETTINGS}
-    environment.update(PIP_USER="0", PYTHONNOUSERSITE="1")
+    environment.update(PIP_USER="0", PIP_QUIET="0", PYTHONNOUSERSITE="1")
     if target.uses_wheels:
         environment.pop("PYTHONPATH", None)
         environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)

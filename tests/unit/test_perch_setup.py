@@ -347,6 +347,12 @@ def test_an_environment_is_kept_where_its_new_packages_cannot_be_fetched(environ
     assert virtualenv.usable() is kept
 
 
+def test_pip_is_not_quiet_where_the_user_has_set_that(monkeypatch):
+    """What it prints tells when it begins to change the environment."""
+    monkeypatch.setenv("PIP_QUIET", "1")
+    assert virtualenv._environment(WHEELS)["PIP_QUIET"] == "0"
+
+
 @pytest.fixture
 def pip(environment, tmp_path, monkeypatch) -> list[list[str]]:
     """The command lines of pip, which does nothing."""
