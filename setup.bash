@@ -16,7 +16,7 @@ _perch_prepend() {  # NAME FOLDER: put FOLDER first in the path variable NAME, o
 
 _perch_end() {  # leave nothing of this file but the environment
   unset -f _perch_prepend _perch_end
-  unset _perch_root _perch_folder
+  unset _perch_root _perch_folder _perch_byte
   if [ -n "${_perch_nounset:-}" ]; then unset _perch_nounset; set -u; fi
 }
 
@@ -28,7 +28,8 @@ if [ ! -f "$_perch_root/.venv/bin/activate" ] ||
 fi
 
 # Every socket of ROS is bound to this address (SECURITY.md). One that Fast DDS cannot read would open them all.
-if [[ ! "${PERCH_NETWORK:-127.0.0.1}" =~ ^((25[0-5]|2[0-4][0-9]|1?[0-9]?[0-9])(\.|$)){4}$ ]]; then
+_perch_byte='(25[0-5]|2[0-4][0-9]|1?[0-9]?[0-9])'
+if [[ ! "${PERCH_NETWORK:-127.0.0.1}" =~ ^($_perch_byte\.){3}$_perch_byte$ ]]; then
   echo "PERCH_NETWORK=$PERCH_NETWORK is not an address such as 127.0.0.1" >&2
   _perch_end
   return 1

@@ -33,8 +33,8 @@ def install(target: Platform, fresh: bool) -> None:
     environment = _environment(target)
     STATE.mkdir(exist_ok=True)
     fresh = fresh or not usable()
-    _UNFINISHED.touch()
     if fresh:
+        _UNFINISHED.touch()
         with Step("virtual environment") as step:
             shutil.rmtree(VENV, ignore_errors=True)
             access = [] if target.uses_wheels else ["--system-site-packages"]
@@ -42,10 +42,10 @@ def install(target: Platform, fresh: bool) -> None:
             step.run([outside, "-m", "venv", *access, VENV], "venv", environment)
     total = sum(_pins(lock.read_text()) for lock in target.locks)
     with Step(f"installing {total} packages") as step:
-        _pip(step, environment, total, *target.locks)
+        _pip(step, environment, total, *target.locks, on_change=_UNFINISHED.touch)
         if target.uses_wheels:
             repair_wheels(VENV)
-    _UNFINISHED.unlink()
+    _UNFINISHED.unlink(missing_ok=True)  # where all packages were there, pip has changed nothing
 
 
 def install_extra(target: Platform, extra: str) -> None:
@@ -63,14 +63,15 @@ def install_extra(target: Platform, extra: str) -> None:
     unfinished.unlink()
 
 
-def _pip(step: Step, environment: Mapping[str, str], total: int, *locks: Path, options: Sequence[str] = ()) -> None:
-    """Install the `total` packages of lock files, without their unused files.
+def _pip(step: Step, environment: Mapping[str, str], total: int, *locks: Path, options: Sequence[str] = (),
+         on_change: Callable[[], object] = lambda: None) -> None:
+    """Install the `total` packages of lock files, without their unused files. `on_change` is called before the first change.
 
     The locks are complete, so pip has nothing to resolve; tests check that they fit together.
     """
     pip = [VENV_PYTHON, "-m", "pip", "install", "--no-deps", "--no-compile", "--progress-bar", "off", "--no-input"]
     quiet = ["--disable-pip-version-check", "--no-warn-script-location"]
-    step.run([*pip, *quiet, *options, *(word for lock in locks for word in ("-r", str(lock)))], "pip", environment, _progress_parser(total))
+    step.run([*pip, *quiet, *options, *(word for lock in locks for word in ("-r", str(lock)))], "pip", environment, _progress_parser(total, on_change))
     for packages in VENV.glob("lib/python3.*/site-packages"):
         slim(packages)
 
@@ -87,9 +88,9 @@ def usable() -> bool:
 
 
 def _environment(target: Platform) -> dict[str, str]:
-    """Return the caller's environment without variables that interfere with pip."""
+    """Return the caller's environment without variables that interfere with pip, whose output is read."""
     environment = {key: value for key, value in os.environ.items() if key not in _USER_SETTINGS}
-    environment.update(PIP_USER="0", PYTHONNOUSERSITE="1")
+    environment.update(PIP_USER="0", PIP_QUIET="0", PYTHONNOUSERSITE="1")
     if target.uses_wheels:
         environment.pop("PYTHONPATH", None)
         environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
@@ -101,8 +102,8 @@ def _pins(lock: str) -> int:
     return len(re.findall(r"^[a-zA-Z0-9]", lock, re.MULTILINE))
 
 
-def _progress_parser(total: int) -> Callable[[str], Optional[str]]:
-    """Return a function that turns pip's lines into a count."""
+def _progress_parser(total: int, on_change: Callable[[], object]) -> Callable[[str], Optional[str]]:
+    """Return a function that turns pip's lines into a count; pip has fetched all packages before it changes any."""
     count = 0
 
     def describe(line: str) -> Optional[str]:
@@ -111,6 +112,7 @@ def _progress_parser(total: int) -> Callable[[str], Optional[str]]:
             count += 1
             return f"{min(count, total)}/{total}"
         if line.startswith("Installing collected"):
+            on_change()
             return "unpacking"
         return None
 

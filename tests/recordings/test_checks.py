@@ -1,17 +1,19 @@
 """`scripts/sensors.py check`: what would make perception fail is named, and what is well is not."""
 
+import itertools
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
-from perch_core.sensors import ImuSensor, load_sensors
+from perch_core.sensors import CameraSensor, ImuSensor, Sensors, load_sensors
 from perch_core.values import CameraImage
 from perch_eval.recordings import check as checks
 from perch_eval.recordings import sensors_command
 from perch_eval.recordings.check import check
 from perch_eval.recordings.imu_check import Report, allan_deviation, check_estimated_biases, check_imu, check_rate, stretches_at_rest
-from perch_eval.recordings.opening import open_recording
+from perch_eval.recordings.opening import BagRecording, open_recording
 from perch_eval.recordings.recording import IMU, Recording, RecordingError
 from perch_eval.recordings.trajectory import Trajectory, evaluate, read_trajectory, write_tum
 from recordings import photo_flight
@@ -74,6 +76,7 @@ def test_nothing_is_wrong_with_a_good_one(heard):
     (dict(imu=times(1 / 9.81)), "imu units", "fails"),
     (dict(imu=times(0.0)), "imu units", "fails"),
     (dict(imu=lambda k, s: s._replace(w_B=(3000.0, 0.0, 40.0))), "imu units", "fails"),
+    (dict(imu=lambda k, s: s._replace(w_B=(np.nan, 0.0, 0.0)) if k % 100 == 0 else s), "imu values", "fails"),
     (dict(imu=lambda k, s: None if 500 < k < 530 else s), "imu gaps", "warning"),
     (dict(imu=lambda k, s: s._replace(stamp=s.stamp - 4_500_000 * (k % 2))), "imu jitter", "warning"),
     (dict(imu=lambda k, s: s if k % 5 == 0 else None), "imu rate", "fails"),
@@ -90,7 +93,6 @@ def test_what_is_wrong_is_named(heard, changes, about, level):
 
 
 def test_blur_is_seen(heard):
-    cv2 = pytest.importorskip("cv2")
     found = spoilt(heard, image=pixels(lambda p: cv2.GaussianBlur(p, (0, 0), 4.0)))
     assert found.get("camera cam0 sharpness") == "warning"
 
@@ -246,6 +248,44 @@ def test_stamps_that_are_none_fail():
         statistics.add(CameraImage(0, "c", 64, 48, "mono8", np.zeros((48, 64), np.uint8)))
     checks.check_camera(report, "cam0", statistics, stamps, None)
     assert any("does not stamp" in finding.text for finding in report.findings)
+
+
+def test_messages_that_cannot_be_used_are_counted_whatever_the_reasons_quote(files, monkeypatch):
+    recording, convert, sizes = open_recording(files / "sqlite3", load_sensors(files / "mine.yaml")), BagRecording._value, itertools.count()
+
+    def value(self, source, connection, message):
+        if source != IMU:
+            raise RecordingError(f"compressed image: {next(sizes)} bytes are no JPEG")
+        return convert(self, source, connection, message)
+
+    monkeypatch.setattr(BagRecording, "_value", value)
+    assert len(list(recording.events())) == recording.samples
+    n = recording.images["cam0"]
+    assert n > 50 and recording.damage.startswith(f"{n} of {n} messages of ") and "are no JPEG" in recording.damage
+
+
+def test_image_files_that_are_missing_or_damaged_are_counted(tmp_path):
+    data = tmp_path / "cam0" / "data"
+    data.mkdir(parents=True)
+    (tmp_path / "cam0" / "data.csv").write_text("".join(f"{10**9 + 10**8 * k},{k}.png\n" for k in range(12)))
+    for k in range(12):
+        cv2.imwrite(str(data / f"{k}.png"), np.full((48, 64), 9 * k, np.uint8))
+    (data / "3.png").unlink()
+    (data / "5.png").write_bytes(b"broken off")
+    sensors = Sensors(name="mine", cameras={"cam0": CameraSensor(model="pinhole", width=64, height=48, focal=(60.0, 60.0), centre=(32.0, 24.0))})
+    for calibration, count in ((None, 2), (sensors, 1)):
+        found = {f.about: f for f in check(open_recording(tmp_path, calibration)).findings}
+        assert f"{count} of 12 image files are missing" in found["recording"].text and found["recording"].level == "warning"
+        assert found["recording"].text.endswith("3.png")
+    assert found["camera cam0 files"] == ("warning", "camera cam0 files", "1 of 11 sampled images could not be decoded")
+
+
+@pytest.mark.parametrize("stamp", ["now", "\u00b2", "9" * 19, "9" * 5000], ids=["word", "square", "beyond int64", "endless"])
+def test_stamps_of_images_that_are_no_nanoseconds_are_refused(tmp_path, stamp):
+    (tmp_path / "cam0").mkdir()
+    (tmp_path / "cam0" / "data.csv").write_text(f"{stamp},a.png\n")
+    with pytest.raises(RecordingError, match="is no stamp in nanoseconds"):
+        open_recording(tmp_path, None)
 
 
 @pytest.mark.parametrize("late, level", [(20_000_000, "ok"), (-5_000_000, "warning"), (600_000_000, "warning")])

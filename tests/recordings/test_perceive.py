@@ -11,11 +11,12 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from perch_core.sensors import load_sensors
-from perch_core.values import ImuSample
+from perch_core.values import CameraImage, ImuSample, OdometryState
 from perch_eval.flight import timed
 from perch_eval.recordings import check, command
 from perch_eval.recordings.command import _unused
 from perch_eval.recordings.opening import BagRecording, _topic
+from perch_eval.recordings.perception import Perception
 from perch_eval.recordings.recording import AslRecording, RecordingError
 from perch_eval.recordings.trajectory import read_trajectory, read_truth
 from recordings import photo_flight
@@ -252,6 +253,18 @@ def test_images_of_one_name_or_stamp_are_all_counted():
     for camera in ("cam0", "cam0", "cam1", "cam1", "cam1"):
         taken[_unused(taken, "1.png", camera)] = None
     assert list(taken) == ["1.png", "cam0/1.png", "cam1/1.png", "cam1/1.png (2)", "cam1/1.png (3)"]
+
+
+def test_an_image_of_another_size_is_left_out_and_ends_nothing(files):
+    file, texts = str(files / "mine.yaml"), []
+    made = Perception(load_sensors(file), file, "cam0", "cam0", "pad_four_tags", {}, [])
+    for node in (made.target, made.wires):
+        node.log.receivers.append(lambda line: texts.append(line.text))
+        for stamp in (1_000_000_000, 1_010_000_000, 1_020_000_000):
+            node.on_odometry(OdometryState(stamp, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, 1e-4 * np.eye(6), 1e-4 * np.eye(6)))
+        node.on_image(CameraImage(1_020_000_000, "", 64, 48, "mono8", np.zeros((48, 64), np.uint8)))
+    assert "64 x 48" in made.sightings[-1].message and sum("64 x 48" in text for text in texts) == 2
+    assert made.target.missed.images == [] == made.wires.gallery.images
 
 
 def test_an_interrupt_leaves_no_report(files, tmp_path, monkeypatch, capsys):

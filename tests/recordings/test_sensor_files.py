@@ -141,6 +141,7 @@ def test_two_cameras_do_not_get_one_name():
     ("resolution: [512, 384]", "resolution: [512]", "resolution"), ("T_cam_imu", "T_other", "T_cam_imu"),
     ("timeshift_cam_imu: -0.005", "timeshift_cam_imu: late", "timeshift_cam_imu"),
     ("timeshift_cam_imu: -0.005", "timeshift_cam_imu: 5.0", "timeshift_cam_imu: 5 s is outside"), ("[300.0,", "[-300.0,", "focal"),
+    ("[300.0,", "[1.0,", "cam0.focal: focal lengths of 1 and 301 px for 512 x 384 px"),
     ("0.000000000000000, 1.000000000000000]", "0.000000000000000, 2.000000000000000]", "rigid")])
 def test_calibrations_that_are_none_are_refused(tmp_path, old, new, words):
     chain, _ = photo_flight.kalibr(tmp_path)

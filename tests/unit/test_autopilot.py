@@ -604,9 +604,12 @@ def test_kill_stops_the_motors_also_in_a_descent_without_commands(age):
 @pytest.mark.parametrize("command, stamp, killed", [(5, 0, True), (5, 9 * NANOSECONDS, True), (5, NANOSECONDS, False), (3, 0, False)])
 def test_the_node_itself_obeys_a_kill_that_is_current(command, stamp, killed, flown_on):
     node = flown_on(16.0)
+    lines: list = []
+    node.log.receivers.append(lines.append)
     node.on_poll(9 * NANOSECONDS + 1)
     node.on_command(ControllerCommand(stamp, command, "by hand"))
     assert ("kill" in node._link.told) is killed
+    assert any("is too old: ignored" in line.text for line in lines) is (command == Command.KILL and not killed)
 
 
 def test_a_clock_that_jumps_back_turns_the_motors_off():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import socket
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -249,6 +250,17 @@ def test_commands_leave_in_the_axes_of_aviation_and_never_stale(autopilot):
     assert autopilot.heard()["SET_ATTITUDE_TARGET"].thrust == 0.0
 
 
+def test_a_command_is_not_held_for_ever_where_the_hosts_clock_stands_still(autopilot):
+    """With `use_sim_time` and no /clock, the time of all polls is the same."""
+    autopilot.say(autopilot.mavlink.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
+    autopilot.heard()
+    autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+    for _ in range(50):
+        autopilot.node.on_poll(autopilot.now)
+    sent = [message.get_type() for message in autopilot.mavlink.parse_buffer(autopilot.link.recv(1 << 20))]
+    assert sent.count("SET_ATTITUDE_TARGET") == 20  # for 0.1 s
+
+
 def test_odometry_leaves_as_ned_with_its_covariance(autopilot):
     P = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     autopilot.node.on_odometry(OdometryState(SECOND, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), (4.0, 5.0, 6.0), (0.1, 0.2, 0.3), P, P))
@@ -411,6 +423,7 @@ def test_kill_stops_the_motors_also_where_no_controller_commands(autopilot):
 
     assert sent(Command.LAND, autopilot.now) is None
     assert sent(Command.KILL, autopilot.now - 2 * SECOND) is None
+    assert any("is too old: ignored" in line.text for line in autopilot.got["log"])
     assert sent(Command.KILL, autopilot.now) == sent(Command.KILL, 0) == (400, 0.0, 21196.0)
 
 
@@ -566,7 +579,8 @@ def test_a_link_that_has_ended_is_opened_anew(autopilot, monkeypatch):
     autopilot.link = theirs
     said = autopilot.heard(2.0)
     assert len(tried) == 3 and min(np.diff(tried)) >= 0.2 * SECOND
-    assert {"HEARTBEAT", "TIMESYNC"} <= set(said) and autopilot.node.offboard == Offboard(PX4)  # its state is unknown
+    assert {"HEARTBEAT", "TIMESYNC"} <= set(said)
+    assert replace(autopilot.node.offboard, _last_streaming=-1e9) == Offboard(PX4)  # its state is unknown
     autopilot.say(autopilot.mavlink.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
     autopilot.heard()
     assert autopilot.node.offboard.following
@@ -590,6 +604,22 @@ def test_a_link_that_is_opened_anew_in_flight_gives_no_thrust_of_a_controller_th
         for _ in range(20):
             autopilot.node.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
             assert ("SET_ATTITUDE_TARGET" in autopilot.heard()) == disarmed
+
+
+def test_a_gap_in_the_commands_as_the_link_ends_is_no_new_start_of_the_controller(autopilot, monkeypatch):
+    """Its commands with the motors off are obeyed in flight, as after the same gap without the end of the link."""
+    autopilot.say(autopilot.mavlink.heartbeat_encode(2, PX4, ARMED, OFFBOARD, 4))
+    for _ in range(20):
+        autopilot.node.on_rates_thrust(RatesThrust(0, True, (0.0, 0.0, 0.0), 9.81))
+        autopilot.heard()
+    autopilot.heard(0.2)
+    ours, theirs = socket.socketpair()
+    monkeypatch.setattr("perch_autopilot.mavlink.Link", lambda _: Link(f"fd:{ours.detach()}"))
+    autopilot.link.close()
+    autopilot.link = theirs
+    autopilot.heard(0.1)
+    autopilot.node.on_rates_thrust(RatesThrust(0, False, (0.0, 0.0, 0.0), 0.0))
+    assert "SET_ATTITUDE_TARGET" in autopilot.heard()
 
 
 @pytest.mark.parametrize("options", [None, 0.0, 8.0])

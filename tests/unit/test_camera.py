@@ -107,6 +107,7 @@ def test_a_camera_survives_camera_info(camera):
 
 @pytest.mark.parametrize(("change", "why"), [
     ({"model": "fisheye624"}, "distortion_model"), ({"distortion": [0.1, 0.2]}, "2 coefficients"), ({"K": np.zeros((3, 3))}, "not calibrated"),
+    ({"K": np.eye(3)}, "1 and 1 px for 640 x 480 px: the camera is not calibrated"),
     ({"distortion": [np.nan] * 5}, "finite"), ({"width": 0}, "0 x 480"), ({"K": np.eye(4)}, "intrinsic matrix")])
 def test_a_camera_info_that_is_none_is_refused(change, why):
     good = dict(model="plumb_bob", width=640, height=480, K=PINHOLE.K, distortion=[0.1, 0.0, 0.0, 0.0, 0.0])

@@ -145,6 +145,16 @@ def test_the_queue_is_bounded():
     assert len(bench.exposures) == MAX_QUEUED and bench.exposures[0] == 150 + EXPOSED // MS
 
 
+def test_images_that_cease_are_named():
+    """The diagnostics of the last image would be repeated for ever."""
+    bench = Bench()
+    bench.odometry(0, 1000), bench.image(990), bench.odometry(1002, 2998)
+    assert not any("no image" in text for text in bench.out.warnings())
+    bench.odometry(3000, 3000)
+    last = bench.out["diagnostics"][-1]
+    assert (last.level, last.message) == (1, "camera_front/image_raw: no image for 2 s") and last.message in bench.out.warnings()
+
+
 def test_odometry_that_never_comes_is_named():
     for component in (Bench().component, mapper()[0]):
         out = Outputs(component)

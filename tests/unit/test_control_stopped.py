@@ -72,6 +72,20 @@ def test_a_command_that_is_repeated_brakes_like_one_that_is_given_once(command, 
     np.testing.assert_allclose(stops[0], stops[1], atol=0.02)
 
 
+@pytest.mark.parametrize("order", [lambda flight: flight.order(Command.HOVER), abort])
+def test_a_hover_that_is_ordered_again_is_not_one_without_orders(order):
+    flight = hovering()
+    flight.component.reconfigure(replace(flight.component.config, flight=FlightSettings(silence_time=0.3)))
+    p = flight.plant.p.copy()
+    for _ in range(3):
+        order(flight)
+        flight.step(0.2)
+        assert flight.state is State.HOVERING, flight.said
+    assert np.linalg.norm(flight.plant.p - p) < 0.02
+    flight.step(0.2)
+    assert flight.state is State.LANDING and "no order for" in flight.component.flight.flight_state.message
+
+
 def test_what_waited_when_the_motors_were_stopped_is_not_flown_when_they_run_again():
     flight = Flight()
     flight.step(0.2)
@@ -169,6 +183,40 @@ def test_a_stop_at_the_geofence_is_not_undone_by_a_plan_that_waits():
     flight.use(flight.law, flight.gains, FlightSettings(fence_high=(x - 0.01, 20.0, 20.0)))
     loop.run(0.5)
     assert [e[2] for e in loop.events[1:]] == ["tracking trajectory 7", "hover: 0.0 m outside the geofence"], loop.events
+
+
+def test_what_waits_when_a_flight_is_stopped_at_the_geofence_is_not_begun_from_another_place():
+    loop, start = leaving()
+    flight, (x, _, _) = loop.controller, loop.plant.p
+    later = along_x(start + 1.5, 0.6, 0.4, 1.0, brakes=True)
+    flight.follow(Order(8, SampledReference(later, flight.vehicle.mass), start + 1.5))
+    flight.use(flight.law, flight.gains, FlightSettings(fence_high=(x - 0.01, 20.0, 20.0)))
+    loop.run(0.02)
+    assert flight.state is State.HOVERING, loop.events
+    flight.use(flight.law, flight.gains, FlightSettings())  # a gust is over, the vehicle is back inside
+    loop.run(1.7)
+    assert flight.state is State.HOVERING and loop.plant.p[0] < 0.3, loop.events
+    assert "trajectory 8 was not started: it starts 0.4" in flight.flight_state.message
+
+
+def test_a_take_off_outside_the_geofence_is_a_landing():
+    flight = Flight()
+    flight.component.reconfigure(replace(flight.component.config, flight=FlightSettings(fence_high=(-0.5, 20.0, 20.0))))
+    flight.step(0.5)
+    flight.order(Command.ARM)
+    flight.follow(flight.path((0, 0, 0), (0, 0, 0.6), 1.0))
+    flight.step(2.5)
+    assert flight.state is State.DISARMED and flight.plant.p[2] < 0.05 and "landing: 0.5 m outside the geofence" in flight.said
+
+
+def test_a_tilted_vehicle_recovers_before_it_lands_outside_the_geofence():
+    loop, _ = leaving()
+    flight = loop.controller
+    flight.use(flight.law, flight.gains, FlightSettings(fence_high=(loop.plant.p[0] - 0.01, 20.0, 20.0)))
+    level = flight.flight_state._replace(ground=flight.flight_state.state_estimate[2])
+    assert flight.supervisor.act(level, False).mode is State.LANDING
+    tilted = level._replace(state_estimate=(*level.state_estimate[:6], 0.0, 0.5, 0.0, 0.75**0.5, 0.0, 0.0, 0.0))
+    assert flight.supervisor.act(tilted, False).mode is State.RECOVERING
 
 
 def test_a_perch_may_begin_in_the_brake_at_the_end_of_a_move():

@@ -103,6 +103,25 @@ def test_a_missing_stretch_of_samples_is_a_gap_at_100_hz_too():
     hover.fly(1.0).assert_running()
 
 
+def test_odometry_beside_a_state_that_waits_for_the_imu_is_ignored():
+    """Images that come before the IMU has passed their exposure: VIO answers with the sample that does, maybe before the estimator has it."""
+    hover = Hover(100.0, vio=None)
+    for _ in range(30):
+        hover.tell(state(hover.now + 5 * MS))
+        hover.tell(odometry(hover.now + 5 * MS))
+        hover.fly(0.01)
+    hover.assert_running()
+    assert hover.out.warnings() == []
+
+
+def test_the_covariance_has_grown_with_the_first_sample_after_a_gap():
+    hover = Hover(100.0, vio=state).fly(1.0)
+    before, hover.vio = hover.last.pose_covariance[0, 0], None
+    hover.now += 300 * MS
+    hover.fly(0.01)
+    assert hover.last.stamp == hover.now and before < 0.02**2 < 0.1**2 < hover.last.pose_covariance[0, 0]
+
+
 def test_odometry_is_ignored_while_whole_states_come_and_used_after():
     """Both come with the same stamps, the odometry first, as a schedule sorts them; it is another 0.3 m away."""
     hover = Hover(vio=None)

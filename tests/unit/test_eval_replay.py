@@ -178,6 +178,14 @@ def test_an_animation_has_a_frame_for_each_moment_and_plots_are_written(recorded
     assert {"tracking.png", "path.png", "rates.png", "thrust.png"} <= {p.name for p in (tmp_path / "plots").iterdir()}
 
 
+def test_an_animation_of_a_vehicle_without_front_camera_shows_the_images_of_the_other_one(recorded):
+    flight = RecordedFlight(recorded[0])
+    truth, images = (flight.values(channel) for channel in ("ground_truth/odometry", "camera_front/image_raw/compressed"))
+    for name, title in (("down", "down camera"), ("side", "no camera images recorded")):
+        view = FlightView.from_flight(Flight({"ground_truth/odometry": truth, f"camera_{name}/image_raw/compressed": images}), load_vehicle("snapdragon"))
+        assert title in [axes.get_title() for axes in animation.Scene(view, 1.2, 1.6).figure.axes]
+
+
 @pytest.mark.parametrize("fps", [12.0, 15.0, 60.0])
 def test_an_animation_takes_its_time(fps, tmp_path):
     animation._write_gif(tmp_path / "f.gif", fps, (np.full((8, 8, 3), k, np.uint8) for k in range(61)))

@@ -100,6 +100,7 @@ def test_a_scenario_says_what_its_nodes_fly():
 
 @pytest.mark.parametrize("ends, off, result, message", [
     (True, 0.0, Result.PERCHED, "inspected along 2 waypoints"), (False, 0.0, Result.MISSED, "inspection given up: held up"),
+    (False, 0.0, Result.REFUSED, "the controller has not accepted the inspection: held up"),
     pytest.param(True, 0.6, Result.PERCHED, "inspected along 2 waypoints", id="the line terms hold it away from its place")])
 def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, off, result, message):
     settings = MissionSettings(waypoints=(1.0, 0.0, 2.0, 0.0, 1.0, 2.0, 2.5, 10.0))
@@ -118,12 +119,13 @@ def test_the_mission_maps_then_flies_the_waypoints_and_ends_in_a_hover(ends, off
                                   target, np.zeros((0, 3))))
         if any(command.name == "ARM" for command, _ in out.commands):
             controller = ControllerState.ARMED
-        if out.reference is not None:
+        if out.reference is not None and (result is not Result.REFUSED or machine.phase is not Phase.INSPECTING):
             reference, controller, id = out.reference, ControllerState.TRACKING, out.trajectory_id
         assert out.query is None, "an inspection needs no planner"
         seen.append(machine.phase)
         outcome = out.outcome
     assert outcome.result is result and message in outcome.message
+    assert result is not Result.REFUSED or seen.count(Phase.INSPECTING) * 0.02 < 1.0
     assert Phase.SEARCHING in seen and Phase.INSPECTING in seen
     if ends:
         np.testing.assert_allclose(p, (1.0, 2.0, 2.5), atol=1e-6)

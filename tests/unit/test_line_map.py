@@ -163,6 +163,14 @@ def test_the_doubt_of_the_cameras_mount_is_counted_once():
         assert line.direction_sigma**2 == pytest.approx(np.linalg.eigvalsh(estimate.covariance[2:4, 2:4])[-1] + sigma**2, rel=1e-6)
 
 
+def test_a_wire_that_was_seen_from_one_place_only_says_so():
+    rng, mapper = np.random.default_rng(9), LineMapper(MapperConfig())
+    body = BodyState(0.0, np.array([0, 0, 2.0]), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3))
+    for k in range(5):
+        result = mapper.update(0.1 * k, body, [observe(rng, WIRE, np.array([0, 0, 2.0]), time=0.1 * k)])
+    assert result.degenerate and result.message == "line 0: seen from one place only: move across the wire"
+
+
 def test_false_sightings_are_forgotten():
     rng = np.random.default_rng(9)
     mapper = LineMapper(MapperConfig())
@@ -172,6 +180,16 @@ def test_false_sightings_are_forgotten():
     mapper.update(1.9, body, [])
     assert len(mapper._tracks) == 1
     mapper.update(2.1, body, [])
+    assert mapper._tracks == []
+
+
+def test_a_wire_of_two_sightings_is_forgotten_though_it_was_triangulated():
+    mapper, wire = LineMapper(MapperConfig()), WireCurve(np.array([3.0, 0.0, 2.5]), np.array([0.0, 1.0, 0.0]))
+    body = BodyState(0.0, np.array([0, 0, 2.0]), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3))
+    for k, height in enumerate((1.87, 2.12)):
+        mapper.update(0.1 * k, body, [observe(np.random.default_rng(9), wire, np.array([0.0, 0.0, height]), time=0.1 * k)])
+    assert [track.estimate is not None for track in mapper._tracks] == [True]
+    mapper.update(2.2, body, [])
     assert mapper._tracks == []
 
 

@@ -73,7 +73,8 @@ class World:
             if command is Command.ARM and self.deaf:
                 self.deaf -= 1
             elif command is Command.ARM and self.controller is ControllerState.ATTACHED:
-                self.controller, self.hover_at = ControllerState.RECOVERING, self.time + 1.0
+                self.controller, self.hover_at, self.perch_end = ControllerState.RECOVERING, self.time + 1.0, None
+                self.q, self.off_at = np.array([0.0, 0.0, 0.0, 1.0]), None
             elif command is Command.ARM:
                 self.controller = ControllerState.ARMED
             elif command is Command.HOVER and self.controller is not ControllerState.ATTACHED:
@@ -224,8 +225,31 @@ def test_a_vehicle_that_comes_off_is_armed_until_the_controller_flies():
     world.deaf = 3
     while world.outcome is None:
         world.tick()
-    assert world.commands == [Command.ARM, Command.ATTACHED] + 4 * [Command.ARM, Command.HOVER]
+    assert world.commands == [Command.ARM, Command.ATTACHED, Command.ARM, Command.HOVER] + 3 * [Command.ARM]
     assert world.outcome.result is Result.MISSED and world.controller is ControllerState.HOVERING
+
+
+def test_a_vehicle_that_cannot_be_armed_after_it_came_off_ends_the_goal_with_the_reason():
+    world = World(stays=False)
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    while world.machine.phase is not Phase.PERCHED:
+        world.tick()
+    world.deaf = 10_000
+    while world.outcome is None:
+        world.tick()
+    assert world.outcome.result is Result.TRACKING_LOST and "(says so)" in world.outcome.message
+    assert world.commands.count(Command.HOVER) == 1
+
+
+def test_motors_that_were_started_because_the_vehicle_came_off_are_not_stopped_again():
+    world = reached(Phase.PERCHED)
+    world.tick()
+    world.machine._stopped_at, world.deaf = world.p + (0.0, 0.0, 0.3), 1  # it has slid
+    while world.machine.phase is Phase.PERCHED:
+        world.tick()
+    world.tick()
+    assert world.machine.phase is Phase.RECOVERING and world.controller is ControllerState.RECOVERING
+    assert Command.ATTACHED not in world.commands[2:]
 
 
 WIRE = Target(0.0, SURFACE.p_WS, Q_PERCH, 0.01, 0.01, (MappedPowerline(4, (1.7, -2.0, 1.2), (1.7, 2.0, 1.2), 0.01, 1e-4 * np.eye(3), 0.01, 30),), 4)
@@ -261,6 +285,29 @@ def test_a_departure_whose_plan_is_not_flown_arms(answers, within, said):
                                   np.zeros((0, 3)), plan))
         query, time = out.query, time + TICK
     assert [command for command, _ in out.commands] == [Command.ARM] and time < within and machine.message.endswith(said)
+
+
+def test_a_departure_waits_until_the_state_of_the_controller_is_known():
+    machine, out = Departure(MissionSettings()), Outputs()
+    machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), 0.0)
+    for k, (state, known) in enumerate(((ControllerState.DISARMED, -np.inf), (ControllerState.ATTACHED, 0.02))):
+        assert out.outcome is None and not out.commands
+        out = machine.tick(Inputs(k * TICK, State(SURFACE.p_WS, Q_PERCH, np.zeros(3), np.zeros(3)), True, state, "says so", 0, None,
+                                  np.zeros((0, 3)), controller_time=known))
+    assert [command for command, _ in out.commands] == [Command.ARM]
+
+
+def test_a_landing_on_the_way_of_a_departure_ends_it_with_what_the_controller_says():
+    moves, query = Moves(MissionSettings()), None
+    moves.wire = WIRE
+    machine = Departure(MissionSettings(), moves=moves)
+    machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), 0.0)
+    for k, state in enumerate((ControllerState.ATTACHED, ControllerState.ATTACHED, ControllerState.TRACKING, ControllerState.LANDING)):
+        plan = Plan(rest_to_rest(np.zeros(3), np.ones(3), 0.0, 0.0, 1.0, k * TICK), 1.0) if query is not None else None
+        out = machine.tick(Inputs(k * TICK, State(SURFACE.p_WS, Q_PERCH, np.zeros(3), np.zeros(3)), True, state, "no odometry", 0, None,
+                                  np.zeros((0, 3)), plan))
+        query = out.query
+    assert out.outcome.result is Result.TRACKING_LOST and out.outcome.message == "controller descends: no odometry"
 
 
 def test_a_target_that_was_lost_has_to_be_in_view_for_as_long_again():
@@ -345,6 +392,16 @@ def test_the_time_limit_of_a_take_off_begins_after_a_long_way():
     world.run(Goal(takeoff_height=1.2, search_timeout=6.0, search_position=np.array([30.0, 0.0, 1.2])))
     assert world.machine.settings.transit_speed * world.machine.settings.phase_timeout < 30.0
     assert world.outcome.result is Result.PERCHED
+
+
+def test_a_search_by_a_vehicle_that_does_not_come_to_rest_ends():
+    world = reached(Phase.SEARCHING)
+    world.machine._moves.slow = lambda state: False
+    began = world.time
+    while world.outcome is None and world.time < began + 60.0:
+        world.tick()
+    assert world.outcome.result is Result.TIMEOUT and "search hover not reached within" in world.outcome.message
+    assert world.commands[-1] is Command.LAND and world.time - began < world.machine.settings.phase_timeout + 1.0
 
 
 def test_a_cancel_at_the_take_off_holds_whether_or_not_it_has_begun():

@@ -142,6 +142,17 @@ def test_feedback_comes_at_changes_and_every_tenth_of_a_second():
     assert 10 <= len(world.goal.told) <= 14
 
 
+def test_a_vehicle_that_may_be_on_its_perch_is_not_armed_before_the_controller_has_said_so():
+    world = World()
+    world.state, receive = ControllerState.ATTACHED, world.mission.on_status
+    world.mission.on_status = lambda status: None
+    world.send().run(0.1)
+    assert world.commands == [] and world.goal.told[-1].message == "waiting for the controller"
+    world.mission.on_status = receive
+    world.run(0.1)
+    assert world.commands == [] and world.goal.result.error_code == Result.PERCHED_ALREADY
+
+
 def test_a_second_goal_goes_on_with_other_numbers():
     world = World().send().run()
     world.goal, world.state, world.flown, world.contact, world.q, world.p = Sent(PerchGoal()), ControllerState.DISARMED, None, None, LEVEL, np.zeros(3)
@@ -524,11 +535,13 @@ def test_cancelled_when_no_way_out_is_left_a_surface_is_the_goals_end():
 
 
 PATH = rest_to_rest(np.zeros(3), SURFACE.p_WS, 0.0, 0.0, 3.0, start_time=20.0)
+NOWHERE = SampledTrajectory(np.array([0.0, 3.0]), *(np.zeros((2, width)) for width in (3, 4, 3, 3, 3, 3, 4)), start_time=20.0)
 
 
 @pytest.mark.parametrize("changes, word", [
     ({"at_end": 7}, "at_end: 7 is outside"), ({"perch_time": NAN}, "perch after nan s"), ({"perch_time": 1e9}, "perch after 1e+09 s"),
-    ({"recovery_start": math.inf}, "recovery_start"), ({"trajectory": PATH}, "trajectory: polynomials")])
+    ({"recovery_start": math.inf}, "recovery_start"), ({"trajectory": PATH}, "trajectory: polynomials"),
+    ({"trajectory": NOWHERE}, "quaternion of sample 0 has norm 0.0000")])
 def test_an_invalid_plan_is_refused_with_the_reason(changes, word):
     world = Wires()
     world.changes = changes

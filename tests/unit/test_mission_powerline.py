@@ -60,6 +60,15 @@ def test_of_a_long_flights_map_the_nearest_lines_are_planned_among():
     assert max(line.segment.centre[0] for line in target.lines) < 4.0 + 5.0 * PLAN_LINES_MAX
 
 
+def test_the_line_is_chosen_by_the_distance_from_each_segment():
+    rng = np.random.default_rng(1)
+    lines = [mapped(k, *map(tuple, rng.uniform(-1.0, 1.0, (2, 3)) * (1.0, 1.0, 0.1))) for k in range(20)]
+    for point in rng.uniform(-1.2, 1.2, (40, 3)) * (1.0, 1.0, 0.5):
+        distances = [float(line.segment.distance(point)) for line in lines]
+        target = target_of(lines, point, 1.0)
+        assert (target.line if target else None) == (int(np.argmin(distances)) if min(distances) < 0.4 else None)
+
+
 def test_a_vertical_line_is_no_target():
     """A tilt about it means nothing."""
     assert target_of([mapped(0, (4.0, 0.0, 2.0), (4.0, 0.0, 6.0))], (4.0, 0.0, 4.25), 1.0) is None

@@ -170,20 +170,32 @@ def test_a_domain_that_ros_cannot_have_is_refused(monkeypatch, domain):
     assert error.value.exit_code == 2
 
 
+def sourced(folder: Path, wheels: bool, **variables: str) -> subprocess.CompletedProcess[str]:
+    """`setup.bash` sourced in a set-up folder, which prints the range of discovery."""
+    shutil.copy(ROOT / "setup.bash", folder)
+    for file in (".venv/bin/activate", "install/setup.bash", *[".venv/share/rclpy/package.xml"] * wheels):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).touch()
+    return subprocess.run(["bash", "--norc", "-c", 'source "$1/setup.bash" && echo "$ROS_AUTOMATIC_DISCOVERY_RANGE"', "bash", str(folder)],
+                          env={"PATH": os.environ["PATH"], **variables}, capture_output=True, text=True)
+
+
 @pytest.mark.parametrize("wheels", [True, False])
 @pytest.mark.parametrize("middleware, limit", [("", "SUBNET"), ("rmw_fastrtps_cpp", "SUBNET"), ("rmw_cyclonedds_cpp", "LOCALHOST")])
 def test_another_middleware_is_refused_where_there_is_none_and_else_does_not_search_the_network(tmp_path, wheels, middleware, limit):
     """The address of `config/fastdds.xml` is a setting of Fast DDS."""
-    shutil.copy(ROOT / "setup.bash", tmp_path)
-    for file in (".venv/bin/activate", "install/setup.bash", *[".venv/share/rclpy/package.xml"] * wheels):
-        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / file).touch()
-    done = subprocess.run(["bash", "--norc", "-c", 'source "$1/setup.bash" && echo "$ROS_AUTOMATIC_DISCOVERY_RANGE"', "bash", str(tmp_path)],
-                          env={"PATH": os.environ["PATH"], "RMW_IMPLEMENTATION": middleware}, capture_output=True, text=True)
+    done = sourced(tmp_path, wheels, RMW_IMPLEMENTATION=middleware)
     if wheels and limit == "LOCALHOST":
         assert done.returncode == 1 and "the ROS wheels have rmw_fastrtps_cpp only: run   unset RMW_IMPLEMENTATION" in done.stderr
     else:
         assert (done.returncode, done.stdout) == (0, f"{limit}\n"), done.stderr
+
+
+@pytest.mark.parametrize("address, good", [
+    ("", True), ("10.0.0.255", True), ("127.0.0.1.", False), ("127.0.0", False), ("256.0.0.1", False), ("localhost", False)])
+def test_an_address_that_fast_dds_cannot_read_is_refused(tmp_path, address, good):
+    done = sourced(tmp_path, True, PERCH_NETWORK=address)
+    assert done.returncode == (not good) and ("is not an address such as 127.0.0.1" in done.stderr) is not good
 
 
 # -- the locks -------------------------------------------------------------------------------------------------------
@@ -319,6 +331,26 @@ def test_an_environment_that_is_killed_at_any_step_is_made_anew(environment, mon
     with pytest.raises(Killed):
         virtualenv.install(WHEELS, fresh=True)
     assert not virtualenv.usable()
+
+
+@pytest.mark.parametrize("lines, kept", [(["Collecting numpy==1"], True), (["Collecting numpy==1", "Installing collected packages: numpy"], False)])
+def test_an_environment_is_kept_where_its_new_packages_cannot_be_fetched(environment, monkeypatch, lines, kept):
+    """Without network a checkout goes on with the commit before; what a failure has changed is made anew."""
+    def run(self, command, name, variables, describe):
+        for line in lines:
+            describe(line)
+        raise SetupError("no network", 1)
+
+    monkeypatch.setattr(progress.Step, "run", run)
+    with pytest.raises(SetupError, match="no network"):
+        virtualenv.install(WHEELS, fresh=False)
+    assert virtualenv.usable() is kept
+
+
+def test_pip_is_not_quiet_where_the_user_has_set_that(monkeypatch):
+    """What it prints tells when it begins to change the environment."""
+    monkeypatch.setenv("PIP_QUIET", "1")
+    assert virtualenv._environment(WHEELS)["PIP_QUIET"] == "0"
 
 
 @pytest.fixture

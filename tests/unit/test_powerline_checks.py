@@ -13,12 +13,14 @@ from perch_core.components import components, stack
 from perch_core.errors import PlanningRefusal
 from perch_core.lines import Segment
 from perch_core.rotor_model import RotorModel, derivative, hover_state
+from perch_core.values import PerchGoal, PowerlinePlanRequest, limits
 from perch_core.vehicle import load_vehicle
 from perch_planner.powerline import guess
 from perch_planner.powerline.certificate import certify, certify_end
 from perch_planner.powerline.flight import simulate
 from perch_planner.powerline.picture import SideView
 from perch_planner.powerline.request import PerchPose, PowerlineRequest
+from perch_planner.powerline.service import check_request as check_service_request
 from perch_planner.powerline.settings import PowerlineSettings
 from perch_planner.powerline.validation import check_request
 
@@ -105,6 +107,14 @@ def test_pose_on_a_line_leans_to_the_side_of_the_start(pitch: float, side: float
     assert np.degrees(so3.angle_between(pose.s3_W, up)) == pytest.approx(pitch, abs=1e-6)
     if 0 < pitch < 180:
         assert pose.s3_W[:2] @ (start - line.centre)[:2] > 0
+
+
+@pytest.mark.parametrize("pitch", [3.1415927, 3.141593, float(np.float32(np.pi))])
+def test_a_pitch_of_pi_that_was_rounded_is_planned_as_the_mission_takes_it(pitch: float) -> None:
+    assert not limits.problem(PerchGoal(mode=1, perch_pitch=pitch, inclination_hint=pitch))
+    check_service_request(PowerlinePlanRequest(start=0, p=np.array([0.0, 0, 4.3]), q=LEVEL, perch_pitch=pitch))
+    pose = PerchPose.on_line(LINE, LINE.centre, pitch, VEHICLE.wire_offset, np.array([0.0, 0, 4.3]))
+    np.testing.assert_allclose(pose.s3_W, [0, 0, -1], atol=1e-6)
 
 
 @pytest.mark.parametrize("s3", [[0.0, 0, 1], [1.0, 0, 0], [0, 0, -1.0], [0.6, 0, -0.8]])

@@ -86,6 +86,55 @@ def test_a_soak_that_is_interrupted_keeps_what_was_flown_and_says_so(tmp_path, m
     assert soak.main(["--out", str(tmp_path), "--logs", str(tmp_path)]) == 130 and written == first
 
 
+def test_a_node_that_ends_is_a_failure_and_what_was_flown_before_it_is_kept(tmp_path, monkeypatch, capsys):
+    class Nodes:
+        """A stack of which one process ends in the second flight, after it was sampled."""
+
+        flown = 0
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def wait_until_ready(self, *_):
+            pass
+
+        def raise_if_ended(self):
+            if self.flown > 1:
+                raise soak.StackError("planner ended: killed by SIGSEGV")
+
+        def endings(self):
+            return ("planner",) * (self.flown > 1)
+
+        @property
+        def pids(self):
+            return {"composed": os.getpid()} | ({"planner": os.getpid()} if self.flown < 2 else {})
+
+    def fly(_, check):
+        nodes.flown += 1
+        check()
+        return SimpleNamespace(outcome="perched", message="")
+
+    nodes, drawn = Nodes(), []
+    client = SimpleNamespace(time=1.0, visible_nodes=None, close=lambda: None, fly=fly, depart=lambda _: (True, ""))
+    for name, value in (("Stack", lambda *_: nodes), ("MissionClient", lambda: client), ("domain_in_environment", nullcontext),
+                        ("plot", lambda found, file: drawn.append(len(found)))):
+        monkeypatch.setattr(soak, name, value)
+    assert soak.main(["--out", str(tmp_path), "--logs", str(tmp_path / "logs"), "--flights", "9"]) == 1 and drawn == [2]
+    page = (tmp_path / "README.md").read_text()
+    assert "1 of 2 flights perched and departed" in page and "flight 2: failed, no departure: planner ended: killed by SIGSEGV" in page
+    assert "| planner |" in page
+
+
+def test_files_that_vanish_from_shared_memory_have_no_size(tmp_path, monkeypatch):
+    (tmp_path / "segment").write_bytes(bytes(3_000_000))
+    (tmp_path / "gone").symlink_to(tmp_path / "nowhere")
+    monkeypatch.setattr(soak.Path, "is_file", lambda _: True)
+    assert soak.shared_memory(tmp_path) == 3.0
+
+
 def test_equal_problems_are_one_line():
     problems = ["flight 3: missed", "flight 9: missed", "composed: +2.00 MB per 100 flights", "flight 10: timeout"]
     assert soak._grouped(problems) == ["flights 3, 9: missed", "composed: +2.00 MB per 100 flights", "flight 10: timeout"]

@@ -63,6 +63,7 @@ def test_standard_board_is_the_papers_pad():
     ("pad_size: [0.6, 0.6]\nfamily: 41h12\ntags: [{id: 0, centre: [0, 0], size: 0.1}]", "41h12"),
     ("pad_size: [0.6, 0.6]\ngrid: {columns: 6, rows: 6, size: 0.088}", "beyond the pad"),
     ("pad_size: [0.9, 0.9]\ngrid: {columns: 30, rows: 30, size: 0.01}", "899 is outside"),
+    ("pad_size: [0.9, 0.9]\ngrid: {columns: 11, rows: 10, size: 0.05}", "grid: 110 tags are more than 100"),
     ("pad_size: [0.6, 0.6]\ntags: [{id: 1, centre: [0, 0], size: 0.1}]\ngrid: {columns: 1, rows: 1, size: 0.1}", "not both"),
     ("pad_size: [0.6, 0.6]\ncolour: red\ntags: [{id: 0, centre: [0, 0], size: 0.1}]", "colour")])
 def test_impossible_boards_are_refused(tmp_path, text, message):

@@ -136,6 +136,15 @@ def test_a_view_of_tiny_tags_on_a_large_board_has_a_bounded_size(monkeypatch):
     assert sides == [2048]
 
 
+def test_any_number_of_tags_is_refined():
+    """Photographs may show more tags than a board has, and OpenCV's remap takes fewer than 2^15 rows."""
+    corners = 40.0 + 60.0 * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    image = np.full((160, 160), 220, np.uint8)
+    image[40:100, 40:100] = 30
+    one, many = (refine_corners(image, PinholeCamera(160, 160, 150.0, 150.0, 79.5, 79.5), np.tile(corners, (n, 1, 1))) for n in (1, 400))
+    np.testing.assert_allclose(many.rays_C, np.repeat(one.rays_C, 400, axis=0), atol=1e-9)
+
+
 @pytest.mark.parametrize("blur", [0.6, 1.5, 2.0, 2.5])
 def test_large_tags_of_a_blurred_grid_are_not_found_at_the_inner_outline_of_their_borders(blur):
     """Tags 170 px wide whose corner squares merge with them: corners found to 3 px, and all measured to 0.5 px."""

@@ -46,6 +46,14 @@ def test_one_that_is_finished_in_time_stays(tmp_path, monkeypatch):
     assert remove_unfinished_segments(tmp_path) == [] and file.exists()
 
 
+def test_one_of_before_the_clock_was_set_back_delays_no_start(tmp_path, monkeypatch):
+    file, waits = tmp_path / "fastrtps_port7411", list[float]()
+    file.write_bytes(bytes(64))
+    os.utime(file, times=(time.time() + 3600.0,) * 2)
+    monkeypatch.setattr(shared_memory.time, "sleep", waits.append)
+    assert remove_unfinished_segments(tmp_path) == [file] and waits == [shared_memory.CREATION_TIMEOUT]
+
+
 def test_our_nodes_start(ports):
     environment, files = ports
     for file in files:

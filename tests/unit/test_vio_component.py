@@ -151,6 +151,16 @@ def test_a_missing_imu_is_named():
     assert component.missing == ""
 
 
+def test_a_camera_without_images_is_named():
+    component = VioComponent(VioComponentConfig())
+    out = Outputs(component)
+    for k in range(201):
+        assert out["diagnostics"] == []
+        component.on_imu(ImuSample(10_000_000 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)))
+    last = out["diagnostics"][-1]
+    assert (last.level, last.message) == (1, "camera_down/image_raw: no image for 2 s") and last.message in out.warnings()
+
+
 @pytest.mark.parametrize("change", [dict(encoding="mono16"), dict(width=320), dict(pixels=np.zeros((480, 640), np.float32)),
                                     dict(pixels=lambda region: None)])
 def test_an_image_of_another_kind_is_refused(change):
@@ -185,6 +195,17 @@ def test_a_vehicle_that_was_started_again_is_followed(shift):
     assert any("restarting" in text for text in flight.out.warnings())
     last = flight.out["state"][-1]
     assert last.stamp > shift and again.error(last, shift)[0] < 0.05
+
+
+def test_stamps_that_jump_ahead_in_flight_leave_position_and_heading_unknown():
+    """Also where no sample after a first jump can be used."""
+    flight = climbing()
+    for jump, gyro in ((3, (math.nan,) * 3), (6, (0.0,) * 3)):
+        for sample in flight.samples[:12]:
+            flight.component.on_imu(sample._replace(stamp=sample.stamp + jump * 10**9, w_B=gyro))
+    known = flight.component._vio._last_pose.present()
+    assert known.covariance[0, 0] > 100.0**2 and known.covariance[3, 3] > 1.0
+    assert any("position and heading are unknown" in text for text in flight.out.warnings())
 
 
 @pytest.mark.parametrize(("step", "again"), [(30, 0), (100, 0), (0, 10), (0, 50)])

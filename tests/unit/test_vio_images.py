@@ -1,6 +1,7 @@
 """VIO on rendered images of a whole perch, and under every fault of camera and IMU."""
 
 import functools
+import tracemalloc
 from collections import deque
 from dataclasses import fields, replace
 
@@ -8,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from closed_loop.branches import branched
+from perch_core.camera import PinholeCamera
 from perch_core.values import ImuSample
 from perch_core.vehicle import load_vehicle
 from open_loop import flight as flights
@@ -155,6 +157,14 @@ def test_an_image_without_noise_has_that_of_its_rounding(level):
         cv2.rectangle(image, (x, 200), (x + 30, 230), 200 if level < 200 else 50, -1)
     features = Tracker(VioConfig().tracker, camera).track(image, np.eye(3))
     assert len(features.ids) > 10 and features.sigma.min() > 1e-4
+
+
+def test_the_tracker_of_a_large_camera_takes_little_memory():
+    tracemalloc.start()
+    Tracker(VioConfig().tracker, PinholeCamera(4000, 3000, 3000.0, 3000.0, 1999.5, 1499.5))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6
 
 
 # -- the whole perch -----------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from perch_core import so3
 from perch_core.sensors import CalibrationSigmas
+from perch_perception.vio.bearing import Bearings, residuals
 from perch_perception.vio.config import FilterConfig, VioConfig
 from perch_perception.vio.sliding import TrackWalk
 
@@ -50,3 +51,21 @@ def test_points_walk_across_the_line_of_sight_only():
     along = R_WC @ np.array([0.0, 1.0, 0.0])
     angle = np.sqrt(np.einsum("i,nij,j->n", along, P, along)) / d[1:]
     assert angle**2 == pytest.approx(TrackWalk(CONFIG, FOCAL).steps(b[:-1], b[1:], d[:-1], d[1:]))
+
+
+@pytest.mark.parametrize("x", [(-0.2, 0.2), (0.9, 1.4)])
+def test_residuals_of_a_walking_point_are_white_wherever_it_crosses_the_view(x):
+    """A camera passes a point at 1 m: near the optical axis, and where it is seen 40 to 55 deg from it."""
+    n, m, rng, X = 4000, 11, np.random.default_rng(4), np.array([0.0, 0.5, 1.0])
+    centres = np.stack([-np.linspace(*x, m), np.zeros(m), np.zeros(m)], axis=1)
+    d = np.linalg.norm(X - centres, axis=1)
+    u, sliding, sigma = (X - centres) / d[:, None], TrackWalk(CONFIG, FOCAL), CONFIG.calibration.track / FOCAL
+    q = sliding.steps(u[:-1], u[1:], d[:-1], d[1:])
+    steps = rng.normal(size=(n, m - 1, 3)) * (np.sqrt(q) * d[1:])[:, None]
+    walk = np.concatenate([np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros((n, 1, 3))], axis=1)
+    b = X + walk - centres + sigma * d[:, None] * rng.normal(size=(n, m, 3))
+    seen = Bearings((b / np.linalg.norm(b, axis=2, keepdims=True)).reshape(-1, 3), np.ones((n * m, 2)))
+    r = residuals(np.broadcast_to(np.eye(3), (n * m, 3, 3)), np.tile(centres, (n, 1)), np.broadcast_to(X, (n * m, 3)), np.eye(3),
+                  np.zeros(3), seen).r
+    white = sliding.whitened(q, d, r.reshape(n, m, 2).transpose(1, 0, 2).reshape(m, -1)) / sigma
+    assert np.mean(white**2) == pytest.approx(1.0, abs=0.1)

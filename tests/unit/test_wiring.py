@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections import deque
 from types import SimpleNamespace
 
 from perch_core.ros.messages import fast
@@ -17,3 +18,18 @@ def test_a_value_without_a_message_is_dropped_and_the_others_are_published():
     for seconds in (1, 1 << 40, 2):  # the second stamp does not fit into its message
         wiring.enter(lambda: wiring.emit("/imu", publication, ImuSample(seconds * NANOSECONDS, (0.0,) * 3, (0.0, 0.0, 9.81))))
     assert len(sent) == 2 and failures == [("/imu", struct.error)]
+
+
+def test_work_that_a_thread_queues_while_the_executor_is_set_is_not_lost():
+    """A job may end between the thread's look for the executor and its entry into the queue, which the executor has taken by then."""
+    wiring, done = Wiring(), []
+    executor = SimpleNamespace(create_task=lambda call, *work: call(*work))
+
+    class Interrupted(deque):
+        def append(self, work):
+            wiring.run_on(executor)
+            super().append(work)
+
+    wiring._pending = Interrupted()
+    wiring.from_thread(done.append, "job")
+    assert done == ["job"]

@@ -121,10 +121,14 @@ class Betaflight(Component[BetaflightParameters]):
         self._link.command(command.armed, sticks)
 
     def on_command(self, command: ControllerCommand) -> None:
-        """Stop the motors on KILL, also where no controller is there to obey it."""
-        if command.command == Command.KILL and not command.is_stale(self._now or 0):
-            self._arming.halt(Stop.KILL)
-            self._link.kill()
+        """Stop the motors on KILL, unless it is stale, also where no controller is there to obey it."""
+        if command.command != Command.KILL:
+            return
+        if command.is_stale(self._now or 0):
+            self.warn(f"KILL of {seconds(command.stamp):.3f} s is too old: ignored; one with the stamp 0 never is")
+            return
+        self._arming.halt(Stop.KILL)
+        self._link.kill()
 
     # -- from it -----------------------------------------------------------------------------------------------------
 

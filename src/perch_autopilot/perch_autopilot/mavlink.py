@@ -11,7 +11,7 @@ If commands stop, set points stop, and the autopilot's own failsafe for their lo
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, nan
 from typing import Any
 
@@ -20,7 +20,7 @@ import numpy as np
 from perch_core.component import Component, Diagnostics, Input, LogLine, Output, Timer
 from perch_core.config import quantity, text
 from perch_core.errors import PerchError
-from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust, RotorState
+from perch_core.values import NANOSECONDS, Command, ControllerCommand, ImuSample, OdometryState, RatesThrust, RotorState, seconds
 from perch_autopilot import frames
 from perch_autopilot.arming import Stop
 from perch_autopilot.clock import MAX_STEP, ClockOffset, clock_jump
@@ -30,7 +30,9 @@ from perch_autopilot.rates import commanded_vehicle
 
 _HANDSHAKE = 3.0                     # for the autopilot's first heartbeat, which come once a second [s]
 _JUMP_SAMPLES = 3                    # samples in a row that do not follow the last one: its clock has jumped
+_POLL = 0.005                        # [s]
 _HELD = 100_000_000                  # rates and thrust that are older are not sent any more [ns]
+_HELD_POLLS = round(_HELD / (_POLL * NANOSECONDS))  # ... or after so many polls: the host's clock may stand still (use_sim_time)
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
 _SET_MODE, _ARM_DISARM, _SET_INTERVAL = 176, 400, 511  # MAV_CMD_DO_SET_MODE, MAV_CMD_COMPONENT_ARM_DISARM, MAV_CMD_SET_MESSAGE_INTERVAL
 _HIGHRES_IMU, _IMU_RATE = 105, 200   # its message id; rate that is requested: autopilots send it at 50 Hz or not at all by default [Hz]
@@ -62,7 +64,7 @@ class Mavlink(Component[MavlinkParameters]):
     rates_thrust = Input(RatesThrust, "rates_thrust_command")
     command = Input(ControllerCommand, "controller/command")
     odometry = Input(OdometryState, "odometry")
-    poll = Timer(0.005, stamping=True)
+    poll = Timer(_POLL, stamping=True)
     imu = Output(ImuSample, "imu/data_raw")
     rotors = Output(RotorState, "rotor_state")
 
@@ -88,7 +90,7 @@ class Mavlink(Component[MavlinkParameters]):
         self._command: RatesThrust | None = None
         self._now: int | None = None         # of the last poll [ns]
         self._start_time = self._command_time = self._last_heartbeat = self._last_rotors = self._opened = self._jumps = 0
-        self._corrupt_frames = self._reported_frames = 0
+        self._corrupt_frames = self._reported_frames = self._held_polls = 0
         self._last_odometry: int | None = None  # stamp of the last odometry that was sent [ns]
         self._samples = 0                       # of the IMU that have come since the last heartbeat to the autopilot
         self._last_sample: int | None = None    # stamp of the autopilot's last sample, by its own clock [ns]
@@ -113,15 +115,19 @@ class Mavlink(Component[MavlinkParameters]):
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
         """Store a command, which each poll sends until it is stale."""
-        self._command, self._command_time = command, self._now or 0
+        self._command, self._command_time, self._held_polls = command, self._now or 0, 0
         self.offboard.arming.command((self._now or 0) * 1e-9, command.armed)
 
     def on_command(self, command: ControllerCommand) -> None:
-        """Stop the motors on KILL in any mode and at any height, also where no controller is there to obey it, or a frame is lost."""
-        if command.command == Command.KILL and not command.is_stale(self._now or 0):
-            self._command = None
-            self.offboard.kill((self._now or 0) * 1e-9)
-            self._send_command(_ARM_DISARM, 0.0, _FORCED)
+        """Stop the motors on KILL, unless it is stale, in any mode and at any height, also without a controller, or where a frame is lost."""
+        if command.command != Command.KILL:
+            return
+        if command.is_stale(self._now or 0):
+            self.warn(f"KILL of {seconds(command.stamp):.3f} s is too old: ignored; one with the stamp 0 never is")
+            return
+        self._command = None
+        self.offboard.kill((self._now or 0) * 1e-9)
+        self._send_command(_ARM_DISARM, 0.0, _FORCED)
 
     def on_odometry(self, state: OdometryState) -> None:
         """Send odometry to the autopilot's own estimator, in its axes, stamped by the host's clock (TIMESYNC); 50 Hz at most."""
@@ -166,7 +172,8 @@ class Mavlink(Component[MavlinkParameters]):
             self._handle_message(message, now)
         self._report_standing_rotors(now)
         command = self._command if self.offboard.takes_thrust else None
-        if command is not None and not 0 <= now - self._command_time <= _HELD:
+        self._held_polls += 1
+        if command is not None and not (0 <= now - self._command_time <= _HELD and self._held_polls <= _HELD_POLLS):
             command = None
         if command is not None and not self.offboard.obeys(command.armed):
             stop = self.offboard.arming.stop
@@ -220,13 +227,10 @@ class Mavlink(Component[MavlinkParameters]):
             return b""
 
     def _on_link_lost(self, error: LinkError) -> None:
-        """Close a link that has ended, and reset all state but the autopilot's type, parameters and arming."""
+        """Close a link that has ended, and forget what only a link tells or has been told: presence, mode, set points, requests."""
         self.log(LogLine("error", str(error), 1.0))
         self.close()
-        before = self.offboard
-        self.offboard = Offboard(before.autopilot, before.armed, options=before.options, angle_boost=before.angle_boost,
-                                 arming=before.arming, forced=before.forced, commanding=before.commanding,
-                                 _disarm_until=before._disarm_until)
+        self.offboard = replace(self.offboard, following=False, _last_heartbeat=-1e9, _streaming_since=None, _last_request=-1e9)
         self._clock, self._last_sample = ClockOffset(), None
 
     def _send_command(self, command: int, *words: float) -> None:

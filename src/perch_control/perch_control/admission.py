@@ -84,12 +84,21 @@ def _check_polynomials(trajectory: FlatTrajectory) -> None:
 def _check_samples(trajectory: SampledTrajectory, vehicle: Vehicle) -> None:
     """Refuse quaternions that are not of unit length, rotor thrusts above twice the vehicle's greatest, and a motion that does not
     follow from both on this vehicle."""
+    check_quaternions(trajectory)
+    _check_size("rotor thrust", trajectory.rotor_thrust, 2.0 * vehicle.thrust_max)
+    _check_motion(trajectory, vehicle.mass)
+
+
+def check_quaternions(trajectory: SampledTrajectory) -> None:
+    """Refuse quaternions that are not of unit length.
+
+    Raises:
+        TrajectoryRefused: with the norm.
+    """
     norms = np.linalg.norm(trajectory.q, axis=-1)
     if not np.abs(norms - 1.0).max() <= 1e-3:
         k = int(np.abs(norms - 1.0).argmax())
         raise TrajectoryRefused(f"quaternion of sample {k} has norm {norms[k]:.4f}, not 1")
-    _check_size("rotor thrust", trajectory.rotor_thrust, 2.0 * vehicle.thrust_max)
-    _check_motion(trajectory, vehicle.mass)
 
 
 def _check_motion(trajectory: SampledTrajectory, mass: float) -> None:

@@ -13,10 +13,11 @@ from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joint
 from perch_control.estimator_verdict import EstimatorVerdict
 from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
+from perch_control.guidance import Hold
 from perch_control.l1 import L1Augmentation
 from perch_control.law import Law
 from perch_control.maneuvers import (
-    attached, descending, entered, hover_after_jump, land_on_command, landing, motors_off, recovered, stopped)
+    attached, descending, entered, following, hover_after_jump, land_on_command, landing, motors_off, recovered, stopped)
 from perch_control.modes import CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.period import MeasuredPeriod
@@ -213,11 +214,17 @@ class FlightController:
         return self._schedule.leave_by_way_out(x, reason) or self._brake_to_hover(x, reason)
 
     def _brake_to_hover(self, x: FlightState, reason: str) -> FlightState:
-        """Discard pending trajectories and brake to a hover, or land where a hover would touch the ground; a hover continues, with its brake."""
+        """Discard pending trajectories and brake to a hover, or land where a hover would touch the ground; a hover continues, with its brake.
+
+        After the brake, it continues as one that has just begun: `silence_time` counts from the last order."""
         self._schedule.clear()
         if x.low:
             return landing(x, f"landing: {reason}", self.settings.land_speed)
-        return x._replace(message=reason) if x.mode is State.HOVERING else stopped(x, reason)
+        if x.mode is not State.HOVERING:
+            return stopped(x, reason)
+        if x.elapsed > x.source.duration:
+            x = following(x, Hold(x.setpoint()))
+        return x._replace(message=reason)
 
     def report_refusal(self, message: str) -> None:
         """Publish why an order was refused."""

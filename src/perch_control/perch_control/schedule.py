@@ -79,7 +79,7 @@ class Schedule:
         order, leaving = self._pending
         source = order.source
         resting = x.mode in (State.ARMED, State.ATTACHED)
-        if resting and x.now >= order.start:
+        if (resting or x.mode is State.HOVERING) and x.now >= order.start:  # the vehicle may have been stopped elsewhere since it was accepted
             try:
                 check_start(order, x.now, x.expected(x.now))
             except TrajectoryRefused as error:

@@ -117,7 +117,9 @@ class Supervisor:
         if outside > _FENCE_SLACK:
             return landing(x, f"landing: {outside:.1f} m outside the geofence", speed)
         if outside > 0.0 and x.mode is State.TRACKING and not committed(x):
-            return stopped(x, f"hover: {outside:.1f} m outside the geofence")
+            where = f"{outside:.1f} m outside the geofence"
+            after = stopped(x, f"hover: {where}")  # tilted or at a surface, the vehicle recovers first
+            return landing(x, f"landing: {where}", speed) if x.low and after.mode is State.HOVERING else after
         if self._monitor.exhausted(x.margin, x.now):
             return landing(x, "landing: the rotors are at their limit", speed)
         if x.order is not None:

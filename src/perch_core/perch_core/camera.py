@@ -21,6 +21,7 @@ from perch_core.errors import ConfigError
 from perch_core.jit import interpreted
 
 IMAGE_SIZE_MIN = 16  # width and height of the smallest image [px]
+FOCAL_MIN = 0.05  # least focal length, as a share of width or height: a pinhole would see 169 deg
 Region = tuple[slice, slice]  # rows and columns of an image
 
 
@@ -294,7 +295,8 @@ def camera_of(model: str, width: int, height: int, K: Array, distortion: Array) 
         distortion: coefficients of the model; empty: no distortion.
 
     Raises:
-        ConfigError: unknown model, wrong number of coefficients, invalid size or intrinsic matrix (all zero: not calibrated).
+        ConfigError: unknown model, wrong number of coefficients, invalid size or intrinsic matrix (all zero, or focal lengths
+            that no lens has: not calibrated).
     """
     K, d = np.asarray(K, float), np.asarray(distortion, float).ravel()
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
@@ -303,6 +305,8 @@ def camera_of(model: str, width: int, height: int, K: Array, distortion: Array) 
         raise ConfigError("camera_info", "d", f"{d.tolist()} is not finite")
     if not IMAGE_SIZE_MIN <= width <= 1 << 15 or not IMAGE_SIZE_MIN <= height <= 1 << 15:
         raise ConfigError("camera_info", "width", f"{width} x {height} px: each must be within [{IMAGE_SIZE_MIN}, {1 << 15}] px")
+    if K[0, 0] < FOCAL_MIN * width or K[1, 1] < FOCAL_MIN * height:
+        raise ConfigError("camera_info", "k", f"focal lengths of {K[0, 0]:g} and {K[1, 1]:g} px for {width} x {height} px: the camera is not calibrated")
     common = int(width), int(height), float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     counts = {"": (0,), "plumb_bob": (0, 4, 5), "rational_polynomial": (0, 8), "equidistant": (0, 4)}
     if model not in counts:

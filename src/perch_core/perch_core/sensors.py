@@ -77,7 +77,7 @@ class CameraSensor:
             return camera_of(name, self.width, self.height, np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
                              np.array(self.distortion if self.model != "pinhole" else ()))
         except ConfigError as error:
-            raise ConfigError("", "distortion", error.problem) from None
+            raise ConfigError("", "focal" if error.key == "k" else "distortion", error.problem) from None
 
     def mount(self, name: str) -> CameraMount:
         """Return the camera with its pose on the body."""

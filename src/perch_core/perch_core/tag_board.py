@@ -21,6 +21,7 @@ from perch_core.errors import ConfigError
 
 FAMILIES = {"16h5": (4, 30), "25h9": (5, 35), "36h10": (6, 2320), "36h11": (6, 587)}
 """AprilTag families that OpenCV supports: modules of the code along a side, and number of tags."""
+TAGS_MAX = 100  # of a board that is localised: its pose takes 0.07 s, and the time grows with the cube of the number
 CORNER_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])  # TL, TR, BR, BL in (s1, s2)
 
 
@@ -120,4 +121,8 @@ def load_board(name_or_path: str | Path) -> TagBoard:
     Raises:
         ConfigError: no such board, or a value that is not usable.
     """
-    return config.load(TagBoard, config.find("boards", name_or_path))
+    path = config.find("boards", name_or_path)
+    board = config.load(TagBoard, path)
+    if len(board.tags) > TAGS_MAX:
+        raise ConfigError(str(path), "tags" if board.grid is None else "grid", f"{len(board.tags)} tags are more than {TAGS_MAX}")
+    return board

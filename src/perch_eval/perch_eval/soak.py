@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -130,6 +130,8 @@ def fly(name: str, seed: int, cameras: bool, composed: Collection[str], hours: f
                     if len(found) >= MAX_CONSECUTIVE_FAILURES and not any(flight.departed for flight in found[-MAX_CONSECUTIVE_FAILURES:]):
                         print(f"\n{MAX_CONSECUTIVE_FAILURES} failures in a row: {found[-1].words}", file=sys.stderr)
                         break
+                    if not found[-1].departed and stack.endings():
+                        break
         except StackError as error:
             print(f"\n{error}", file=sys.stderr)
         except KeyboardInterrupt:
@@ -147,24 +149,39 @@ def _fly_once(client: MissionClient, scenario: Any, stack: Stack) -> Flight:
         if outcome in ("perched", "perched_already"):
             departed, message = client.depart(stack.raise_if_ended)
             error = error or ("" if departed else message)
-    except StackError:
-        raise
+        stack.raise_if_ended()
     except PerchError as exception:
-        error = str(exception)
-    shared = sum(file.stat().st_size for file in Path("/dev/shm").glob("*") if file.is_file()) / 1e6
-    return Flight(round(client.time, 3), outcome, departed, error, {name: sample(pid) for name, pid in stack.pids.items()}, round(shared, 3))
+        departed, error = False, str(exception)
+    samples = {}
+    for name, pid in stack.pids.items():
+        with suppress(psutil.Error):  # it has just ended: the next flight fails
+            samples[name] = sample(pid)
+    return Flight(round(client.time, 3), outcome, departed, error, samples, round(shared_memory(), 3))
+
+
+def shared_memory(folder: Path = Path("/dev/shm")) -> float:
+    """Return the size of the files in shared memory [MB]."""
+    size = 0
+    for file in folder.iterdir():
+        with suppress(OSError):  # it has been removed meanwhile
+            size += file.stat().st_size if file.is_file() else 0
+    return size / 1e6
 
 
 def growth(flights: Sequence[Flight]) -> dict[str, dict[str, Any]]:
     """Return memory, its slope [MB per 100 flights], and the later range of descriptors and threads, of each process."""
     found = {}
-    for name in flights[0].processes:
-        own = [flight.processes[name] for flight in flights]
+    for name, own in _samples(flights).items():
         rest = own[min(WARM_UP_FLIGHTS, len(own) // 2):]
         found[name] = {"rss_first_MB": own[0].rss, "rss_last_MB": own[-1].rss, "slope_MB_per_100": slope([one.rss for one in own]),
                        "descriptors": [min(one.descriptors for one in rest), max(one.descriptors for one in rest)],
                        "threads": [min(one.threads for one in rest), max(one.threads for one in rest)]}
     return found
+
+
+def _samples(flights: Sequence[Flight]) -> dict[str, list[Sample]]:
+    """Return the samples of each process from the first flight on; after a process has ended there are none."""
+    return {name: [flight.processes[name] for flight in flights if name in flight.processes] for name in flights[0].processes}
 
 
 def find_problems(flights: Sequence[Flight]) -> list[str]:
@@ -196,11 +213,10 @@ def plot(flights: Sequence[Flight], file: Path) -> None:
     figure = Figure(figsize=(7.0, 8.0), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     x = np.arange(1, len(flights) + 1)
-    for name in flights[0].processes:
-        own = [flight.processes[name] for flight in flights]
-        axes[0].plot(x, [one.rss - own[0].rss for one in own], label=name)
-        axes[1].plot(x, [one.descriptors for one in own])
-        axes[2].plot(x, [one.threads for one in own])
+    for name, own in _samples(flights).items():
+        axes[0].plot(x[:len(own)], [one.rss - own[0].rss for one in own], label=name)
+        axes[1].plot(x[:len(own)], [one.descriptors for one in own])
+        axes[2].plot(x[:len(own)], [one.threads for one in own])
     axes[3].plot(x, [flight.shared for flight in flights], "k")
     for ax, label in zip(axes, ("memory since the\nfirst flight [MB]", "descriptors", "threads", "/dev/shm [MB]")):
         ax.set_ylabel(label)

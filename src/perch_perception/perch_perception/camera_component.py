@@ -12,7 +12,7 @@ import numpy as np
 
 from perch_core import config
 from perch_core.camera_mount import CameraMount
-from perch_core.component import Component, Input
+from perch_core.component import Component, Diagnostics, Input
 from perch_core.errors import ConfigError
 from perch_core.values import CameraImage, CameraModel, OdometryState, Transform, seconds
 from perch_core.vehicle import load_vehicle
@@ -24,6 +24,7 @@ from perch_perception.world_frames import is_world
 
 MAX_QUEUED = 10       # images; beyond that the oldest is dropped
 MAX_STAMP_LEAD = 0.5  # an image whose stamp is further ahead of the odometry is refused [s]
+SILENCE = 2_000_000_000  # without an image, after which that is reported [ns]
 
 
 class CameraConfig(Protocol):
@@ -81,6 +82,8 @@ class CameraComponent(Component[C], ABC):
         self.mounted = MountedCamera(mounts[config.camera], self._calibrated, config.extrinsics, self.warn)
         self.dropped = 0
         self._queue: deque[CameraImage] = deque()
+        self._now: int | None = None  # newest stamp of IMU or odometry [ns]
+        self._heard: int | None = None  # that stamp when the last image came, or its absence was reported
         self._topic = self._channel("image")
 
     def warm_up(self) -> None:
@@ -126,6 +129,7 @@ class CameraComponent(Component[C], ABC):
 
     def on_image(self, image: CameraImage) -> None:
         """Queue an image, and use all images that can be used."""
+        self._heard = self._now
         if self._calibrated and self.mounted.mount is None:
             self.on_camera_info(CameraModel(image.stamp, image.frame, self.mounted.nominal.camera))
         self.mounted.check_image_frame(self._topic, image.frame)
@@ -147,6 +151,17 @@ class CameraComponent(Component[C], ABC):
     def clear_queue(self) -> None:
         """Drop all queued images, e.g. after a restart of their data source."""
         self._queue.clear()
+        self._heard = None
+
+    def note_time(self, now: int) -> None:
+        """Report, in log and diagnostics, that no image has come for `SILENCE`; `now`: newest stamp of IMU or odometry [ns]."""
+        self._now = now
+        if self._heard is None:
+            self._heard = now
+        elif now - self._heard >= SILENCE:
+            self._heard, text = now, f"{self._topic}: no image for {1e-9 * SILENCE:g} s"
+            self.warn(text, 1.0)
+            self.diagnostics(Diagnostics(now, {"dropped": self.dropped}, 1, text))
 
     def _channel(self, port: str) -> str:
         return getattr(type(self), port).channel(self)
@@ -205,6 +220,7 @@ class PosedCameraComponent(CameraComponent[C]):
         if verdict is StampVerdict.RESTARTED:
             self.warn(f"odometry: stamp jump to {state.stamp} ns: restarting")
             self.restart()
+        self.note_time(state.stamp)
         body = BodyState(seconds(state.stamp), np.array(state.p_WB), np.array(state.q_WB), np.array(state.v_WB), np.array(state.w_B),
                          state.pose_covariance)
         self.bodies.add(body if state.has_twist else self.bodies.with_twist(body))

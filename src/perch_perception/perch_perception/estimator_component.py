@@ -89,6 +89,8 @@ class StateEstimator(Component[EstimatorConfig]):
         outcome = self.filter.add_imu(taken)
         if outcome is not ImuOutcome.USED:
             self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)
+        if outcome is ImuOutcome.GAP:
+            self._covariance_age = COVARIANCE_STRIDE
         motion = self.filter.motion
         if motion is not None:
             self._emit(sample.stamp, motion)
@@ -128,7 +130,7 @@ class StateEstimator(Component[EstimatorConfig]):
                 self.warn(f"{channel}: {error}: not used", 1.0)
                 continue
             outcome = self.filter.add_vio(pose)
-            if not is_odometry and (outcome.used or outcome is VioOutcome.DUPLICATE):
+            if not is_odometry and (outcome.used or outcome in (VioOutcome.DUPLICATE, VioOutcome.WAITING)):
                 self._newest_state = stamp
             self._covariance_age = COVARIANCE_STRIDE
             if outcome not in (VioOutcome.STARTED, VioOutcome.APPLIED, VioOutcome.WAITING, VioOutcome.NO_IMU):

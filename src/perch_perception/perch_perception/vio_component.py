@@ -95,8 +95,13 @@ class VioComponent(CameraComponent[VioComponentConfig]):
         if taken is None:
             return
         if self._intake.restarted:
+            elsewhere = self._vio.has_left_start_before(taken.stamp)
             self._begin()
+            if elsewhere:
+                self._vio.forget_start(taken.stamp)
+                self.warn("imu/data_raw: stamps jumped ahead after the vehicle had left its start: position and heading are unknown", 0.0)
             self.clear_queue()
+        self.note_time(taken.stamp)
         outcome = self._vio.add_imu(taken)
         if outcome is not ImuOutcome.USED:
             self.warn(f"imu/data_raw: sample at {sample.stamp} ns {outcome.value}", 1.0)

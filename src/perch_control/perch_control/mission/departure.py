@@ -41,11 +41,15 @@ class Departure(MissionMachine):
             self._fail_attempt(inputs, "departing")
         elif inputs.controller is ControllerState.TRACKING and self._requested_at is not None:
             pass
-        elif inputs.controller is not ControllerState.ATTACHED:
+        elif self._requested_at is not None and self._handle_descent(inputs, outputs):
+            pass
+        elif inputs.controller is not ControllerState.ATTACHED and inputs.controller_time > -np.inf:
             self._end(outputs, Result.REFUSED, f"not perched: the controller is {inputs.controller.name.lower()}")
         elif self._elapsed(inputs) > self.settings.phase_timeout:
             why = inputs.controller_message if inputs.estimator_ready else "the estimator is not ready"
             self._end(outputs, Result.TIMEOUT, f"no departure within {self.settings.phase_timeout:g} s: {why}")
+        elif inputs.controller_time == -np.inf:
+            self.message = "waiting for the controller"
         elif inputs.estimator_ready and not self._no_plan and (wire := self._moves.wire) is not None:
             if self._requested_at is None:
                 self._requested_at, outputs.query = inputs.time, self._way_out(inputs, wire)

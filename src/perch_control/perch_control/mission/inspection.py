@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from perch_core.values import PerchGoal
+from perch_control.mission.machine import ACCEPTANCE_TIMEOUT
 from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Goal, Inputs, Outputs, Phase, Result, Target
@@ -47,11 +48,15 @@ class InspectionMission(LineMission):
     def _inspecting(self, inputs: Inputs, outputs: Outputs) -> None:
         if self._handle_fallback(inputs, outputs):
             return
-        if inputs.trajectory_id == self._flown_id and inputs.controller is ControllerState.HOVERING:
+        hovers = inputs.controller is ControllerState.HOVERING
+        if hovers and inputs.trajectory_id == self._flown_id:
             if inputs.time < self._inspected:
                 self._fail_attempt(inputs, f"inspection given up: {inputs.controller_message}")
             else:
                 self._end(outputs, Result.PERCHED, f"inspected along {len(self._places)} waypoints")
+        elif hovers and inputs.time > self.since + LEAD + ACCEPTANCE_TIMEOUT:
+            outputs.commands.append((Command.HOVER, "the inspection was not accepted"))  # and must not be later
+            self._end(outputs, Result.REFUSED, f"the controller has not accepted the inspection: {inputs.controller_message}")
         elif inputs.time > self._inspected + self.settings.arming_timeout:
             outputs.commands.append((Command.HOVER, "the inspection does not end"))
             self._fail_attempt(inputs, f"the inspection does not end: {inputs.controller_message}")

@@ -17,6 +17,7 @@ from perch_control.mission.values import Command, ControllerState, Goal, Inputs,
 
 SEARCH_RISE = 0.25              # height change of the search pattern [m]
 SEARCH_TURN = np.radians(30.0)  # its sweep [rad]
+ACCEPTANCE_TIMEOUT = 0.5  # a controller that still hovers so long after a trajectory's start has not accepted it [s]
 _FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
 
 
@@ -153,6 +154,8 @@ class MissionMachine(ABC):
             outputs.commands.append((Command.DISARM, "arming took too long"))
             why = "the estimator is not ready" if not inputs.estimator_ready else inputs.controller_message
             self._end(outputs, Result.TIMEOUT, f"not armed within {self.settings.arming_timeout:g} s: {why}")
+        elif inputs.estimator_ready and inputs.controller_time == -np.inf:  # it may be attached: ARM would start it from its perch
+            self.message = "waiting for the controller"
         elif inputs.estimator_ready and self._should_request_arm(inputs):
             outputs.commands.append((Command.ARM, "goal accepted"))
             self.message = "arming"
@@ -211,7 +214,8 @@ class MissionMachine(ABC):
             self._end(outputs, result, f"{self._failure}; {inputs.controller_message if landing else 'on the ground'}")
         elif self._elapsed(inputs) > self.settings.phase_timeout:
             outputs.commands.append((Command.LAND, "recovery took too long"))
-            self._end(outputs, Result.TRACKING_LOST, f"{self._failure}; no hover within {self.settings.phase_timeout:g} s, landing")
+            why = f"no hover within {self.settings.phase_timeout:g} s ({inputs.controller_message}), landing was commanded"
+            self._end(outputs, Result.TRACKING_LOST, f"{self._failure}; {why}")
         elif resting and self._elapsed(inputs) > self.settings.settle_time:
             self._recovered(inputs, outputs)
 
@@ -244,15 +248,16 @@ class MissionMachine(ABC):
     # -- endings -----------------------------------------------------------------------------------------------------
 
     def _handle_fallback(self, inputs: Inputs, outputs: Outputs) -> bool:
-        """Whether the phase was left, as the controller recovers or descends, or as the take-off takes too long."""
+        """Whether the phase was left, as the controller recovers or descends, or as a move does not come to rest."""
         if inputs.controller is ControllerState.RECOVERING:
             self._fail_without_retry(inputs, f"controller recovers: {inputs.controller_message}")
             return True
         if self._handle_descent(inputs, outputs):
             return True
         limit = self._moves.length + self.settings.phase_timeout
-        if self.phase is Phase.TAKE_OFF and self._elapsed(inputs) > limit:
-            outputs.commands.append((Command.LAND, "take-off took too long"))
+        if (self.phase in (Phase.TAKE_OFF, Phase.SEARCHING) and inputs.time - self._moves.began > limit
+                and not self._moves.arrived(inputs.time, inputs.state)):
+            outputs.commands.append((Command.LAND, "search hover not reached"))
             self._end(outputs, Result.TIMEOUT, f"search hover not reached within {limit:.0f} s; landing")
             return True
         return False

@@ -8,13 +8,12 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from perch_control.mission.machine import MissionMachine
+from perch_control.mission.machine import ACCEPTANCE_TIMEOUT, MissionMachine
 from perch_control.mission.moves import LEAD, Moves
 from perch_control.mission.settings import MissionSettings
 from perch_control.mission.values import Command, ControllerState, Inputs, Outputs, Phase, Plan, PlanQuery, Refusal, Result, Target
 from perch_control.mission.ways_out import WaysOut
 
-PERCH_ACCEPTANCE_TIMEOUT = 0.5  # a controller that still hovers so long after a plan's start has not accepted it [s]
 REPLACED_TIMEOUT = 0.1    # a plan that is still flown so long after its successor's start has not been replaced [s]
 ATTACHED_RETRY = 0.1      # period of the command ATTACHED while the controller still flies although the vehicle is attached [s]
 _IN_FLIGHT = (ControllerState.TRACKING, ControllerState.HOVERING, ControllerState.RECOVERING)
@@ -81,8 +80,8 @@ class PerchingMission(MissionMachine, Generic[R]):
         """Act on a contact that was not detected."""
 
     def holds(self, inputs: Inputs) -> bool:
-        """Whether an abandoned perch holds the vehicle after all, as the contact or the abort was late."""
-        return (self._flown_id > 0 and -self.settings.contact_early < inputs.time - self._running.plan.end < 1.0
+        """Whether an abandoned perch holds the vehicle after all, as the contact or the abort was late; never after motors were started."""
+        return (self._flown_id > 0 and not self._detached and -self.settings.contact_early < inputs.time - self._running.plan.end < 1.0
                 and self._adhesion.is_conclusive(inputs.state) and self._adhesion.attached(inputs.state, self._running.target))
 
     # -- phases ------------------------------------------------------------------------------------------------------
@@ -119,7 +118,7 @@ class PerchingMission(MissionMachine, Generic[R]):
         if inputs.controller is ControllerState.RECOVERING or hovers and inputs.trajectory_id >= self._first_id:
             self._fail_without_retry(inputs, f"perch given up: {inputs.controller_message}")
             return
-        if hovers and inputs.time > self._first_start + PERCH_ACCEPTANCE_TIMEOUT:
+        if hovers and inputs.time > self._first_start + ACCEPTANCE_TIMEOUT:
             outputs.commands.append((Command.HOVER, "the plan was not accepted"))  # and must not be later
             self._end(outputs, Result.REFUSED, f"the controller has not accepted the plan: {inputs.controller_message}")
             return
@@ -154,7 +153,7 @@ class PerchingMission(MissionMachine, Generic[R]):
         rested, attached = self._elapsed(inputs) > self.settings.rest_time, inputs.controller is ControllerState.ATTACHED
         if self._adhesion.detached(inputs.state) or rested and attached and not self._adhesion.rests(inputs.state, self._stopped_at):
             self._detached = True
-            self._start_motors(outputs)
+            outputs.commands += [(Command.ARM, "came off the surface"), (Command.HOVER, "came off the surface")]
             self._fail_attempt(inputs, "came off the surface after the motors stopped")
         elif rested and not attached:
             self._end(outputs, Result.TRACKING_LOST, f"the controller is not attached: {inputs.controller_message}")
@@ -168,14 +167,10 @@ class PerchingMission(MissionMachine, Generic[R]):
             self._attached_sent_at = inputs.time
             outputs.commands.append((Command.ATTACHED, "repeated"))  # the first command was lost
 
-    def _start_motors(self, outputs: Outputs) -> None:
-        """Start the motors and hover: the vehicle has come off."""
-        outputs.commands += [(Command.ARM, "came off the surface"), (Command.HOVER, "came off the surface")]
-
     def _recovering(self, inputs: Inputs, outputs: Outputs) -> None:
         super()._recovering(inputs, outputs)
         if self._detached and self.phase is Phase.RECOVERING and inputs.controller is ControllerState.ATTACHED:
-            self._start_motors(outputs)  # the commands before were lost, or refused for a moment
+            outputs.commands.append((Command.ARM, "came off the surface"))  # the command before was lost, or refused for a moment
 
     def _enter(self, phase: Phase, time: float, message: str) -> None:
         super()._enter(phase, time, message)

@@ -8,8 +8,9 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.component import Unavailable
-from perch_core.trajectory import FlatTrajectory
+from perch_core.trajectory import FlatTrajectory, SampledTrajectory
 from perch_core.values import AtEnd, PerchPlan, PerchPlanRequest, PowerlinePlan, PowerlinePlanRequest, TrajectoryOrder, limits, nanoseconds
+from perch_control.admission import TrajectoryRefused, check_quaternions
 from perch_control.mission.values import Plan, PlanQuery, Refusal
 
 _ROUNDING = 1e-6  # of the times in an answer [s]
@@ -52,6 +53,11 @@ def plan_answer(plan: PerchPlan | PowerlinePlan | Unavailable) -> Plan | Refusal
         return Refusal(f"invalid plan: perch after {duration:g} s, in a trajectory of {trajectory.duration:g} s")
     if problem := limits.problem(order):
         return Refusal(f"invalid plan: {problem}")
+    if isinstance(trajectory, SampledTrajectory):
+        try:
+            check_quaternions(trajectory)
+        except TrajectoryRefused as error:
+            return Refusal(f"invalid plan: {error}")
     return Plan(trajectory, duration, AtEnd(order.at_end), order.recovery_start)
 
 

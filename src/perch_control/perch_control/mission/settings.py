@@ -47,7 +47,7 @@ class MissionSettings:
     rest_time: ClassVar[float] = 0.6  # rest with motors off that confirms the perch [s]
     arming_timeout: ClassVar[float] = 10.0  # [s]
     arm_retry_period: ClassVar[float] = 1.0  # between two requests to arm [s]
-    phase_timeout: ClassVar[float] = 20.0  # longest take-off or recovery [s]
+    phase_timeout: ClassVar[float] = 20.0  # longest recovery, and longest wait for a planner or for rest after a move [s]
 
     def __post_init__(self) -> None:
         if len(self.waypoints) % 4:

@@ -194,7 +194,7 @@ class Inputs:
     cancel: bool = False
     imu_period: float = NOMINAL_PERIOD  # [s]
     way_out: Plan | Refusal | None = None
-    controller_time: float = math.inf  # stamp of the controller's state [s]
+    controller_time: float = math.inf  # stamp of the controller's state [s]; -inf: it is not known
 
 
 @dataclass(frozen=True)

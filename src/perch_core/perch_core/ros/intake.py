@@ -19,7 +19,7 @@ from rclpy.subscription import Subscription
 MATCH_PERIOD = 1.0  # of the check of the publishers' reliability for raw inputs [s]
 TAKE_PERIOD = 0.02  # lazy inputs are read at least this often [s]
 TAKE_MAX = 200      # messages of one lazy input that are read at a time: a flood leaves time for other events
-SHARED_TOPICS = ("/tf", "/tf_static")  # topics with many publishers, inside this process and outside
+SHARED_TOPICS = ("/tf", "/tf_static")  # channels with many publishers, inside this process and outside
 
 
 class Intake:
@@ -44,11 +44,12 @@ class Intake:
             node.get_logger().warning(f"{error}: not subscribed")
             return
         resolved = node.resolve_topic_name(channel)
-        handler = partial(node.guarded, port.name, port.handler(node.component))
-        if self._wiring.writer(resolved) is not None and resolved not in SHARED_TOPICS:
+        if self._wiring.writer(resolved) is not None and channel not in SHARED_TOPICS:
             self.private.add(resolved)
-            self._wiring.add_reader(resolved, self._local_receiver(port, row, channel, resolved, handler))
+            receive_local = self._local_receiver(port, row, channel, resolved, port.handler(node.component))
+            self._wiring.add_reader(resolved, partial(node.guarded, port.name, receive_local))
             return
+        handler = partial(node.guarded, port.name, port.handler(node.component))
         if port.value is not Serialized:
             self._subscribe(port, row, _Reader(node, channel, row, handler), row.qos.subscribe)
             return
@@ -92,6 +93,7 @@ class Intake:
 
     @staticmethod
     def _local_receiver(port: Input[Any], row: topics.Topic, channel: str, topic: str, handler: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return the function that takes a neighbour's value; it raises an exception for a value that has no message."""
         if port.value is not Serialized:
             return handler
         return lambda value: handler(Serialized(topic, getattr(value, "stamp", 0), topics.encode(channel, value), row.message))

@@ -31,7 +31,8 @@ def remove_unfinished_segments(folder: Path = FOLDER) -> list[Path]:
     for file in folder.iterdir() if folder.is_dir() else ():
         with suppress(OSError):  # gone already, or another user's
             if PORT.fullmatch(file.name) and _unfinished(file):
-                time.sleep(max(0.0, CREATION_TIMEOUT - (time.time() - file.stat().st_mtime)))
+                age = time.time() - file.stat().st_mtime  # negative where the clock was set back
+                time.sleep(min(max(0.0, CREATION_TIMEOUT - age), CREATION_TIMEOUT))
                 if _unfinished(file):
                     with file.open("r+b") as segment:
                         segment.write(CORRUPTED.to_bytes(4, "little"))

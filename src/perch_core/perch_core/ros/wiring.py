@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from rclpy.node import Node
@@ -79,7 +80,7 @@ class Wiring:
         self._working, self._urgent = False, False
         self._last_sent = 0.0  # time of the last publication, monotonic clock [s]
         self._executor: Any = None
-        self._pending: deque[tuple[Any, ...]] = deque()  # work that threads have queued before there was an executor
+        self._pending: deque[tuple[Any, ...]] = deque()  # work that threads have queued for the executor
         self.participants: dict[str, Any] = {}  # of a lockstep, in this process
         self.hosts_schedule = False             # a lockstep's vehicle is in this process
         self.bundled = False
@@ -138,17 +139,17 @@ class Wiring:
             self._working = False
 
     def run_on(self, executor: Any) -> None:
-        """Set the executor that runs the nodes' callbacks, and give it the work that threads have queued before."""
+        """Set the executor that runs the nodes' callbacks, and give it the work that threads have queued; any thread may call this."""
         self._executor = executor
         while self._pending:
-            executor.create_task(self.enter, *self._pending.popleft())
+            with suppress(IndexError):  # another thread has taken it
+                executor.create_task(self.enter, *self._pending.popleft())
 
     def from_thread(self, work: Callable[..., None], *arguments: Any) -> None:
         """Schedule work on the executor's thread; any thread may call this. Work must not raise: that would end the process."""
-        if self._executor is None:
-            self._pending.append((work, *arguments))
-        else:
-            self._executor.create_task(self.enter, work, *arguments)
+        self._pending.append((work, *arguments))
+        if self._executor is not None:  # read after the work is queued: either this call or `run_on` of another thread finds it
+            self.run_on(self._executor)
 
 
 def foreign_publishers(node: Node, topic: str, known: set[str]) -> list[str]:

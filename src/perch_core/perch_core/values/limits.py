@@ -8,7 +8,7 @@ current state (stamps, frames, position) or on the vehicle is checked by the rec
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import hypot, inf, isfinite, pi
 from typing import Any
 
@@ -194,6 +194,7 @@ STAMP = Limit(0, (2**31 - 1) * NANOSECONDS, "ns")
 POSITION, VELOCITY, ACCELERATION = _vector(1e4, "m"), _vector(100.0, "m/s"), _vector(1e3, "m/s^2")
 ANGULAR_VELOCITY = _vector(100.0, "rad/s")  # gyroscopes end at 70 rad/s (4000 deg/s)
 _SPECIFIC_THRUST = Limit(0.0, 1e3, "m/s^2")
+TILT = Limit(0.0, pi + 1e-6, "rad")  # pi may be rounded, as in 3.1415927
 FRAME = Text(256)
 ID = Limit(0, 2**32 - 1)
 _PIXELS = Limit(1, 1e4, "px")
@@ -240,8 +241,8 @@ LIMITS: dict[type, dict[str, Any]] = {
     SetControllerRequest: {"type": Text(100)},
     PerchGoal: {
         "takeoff_height": Limit(0.3, 10.0, "m", optional=True), "search_frame": FRAME, "search_position": POSITION, "search_attitude": Unit(),
-        "search_timeout": Limit(1e-3, 300.0, "s", optional=True), "inclination_hint": Limit(0.0, pi, "rad", optional=True),
-        "perch_point": POSITION, "perch_pitch": Limit(0.0, pi + 1e-6, "rad"), "attempts": Limit(0, 100)},
+        "search_timeout": Limit(1e-3, 300.0, "s", optional=True), "inclination_hint": replace(TILT, optional=True),
+        "perch_point": POSITION, "perch_pitch": TILT, "attempts": Limit(0, 100)},
     PerchPlanRequest: {
         "start": STAMP, "p": POSITION, "v": VELOCITY, "a": ACCELERATION, "j": _vector(1e5, "m/s^3"), "yaw": Limit(-1e3, 1e3, "rad"),
         "yaw_rate": Limit(-100.0, 100.0, "rad/s"), "p_WS": POSITION, "q_WS": Unit(), "target_velocity": VELOCITY,
@@ -251,7 +252,7 @@ LIMITS: dict[type, dict[str, Any]] = {
         "thrust_ratio": Limit(0.0, 2.0, ""), "objective": Limit(0, 4)},
     PowerlinePlanRequest: {
         "start": STAMP, "p": POSITION, "q": Unit(1e-2), "v": VELOCITY, "w": ANGULAR_VELOCITY, "rotor_thrust": Limit(0.0, 1e3, "N", (-1,), 4),
-        "lines": Each(MappedPowerline, PLAN_LINES_MAX), "target_line": ID, "perch_point": POSITION, "perch_pitch": Limit(0.0, pi + 1e-9, "rad"),
+        "lines": Each(MappedPowerline, PLAN_LINES_MAX), "target_line": ID, "perch_point": POSITION, "perch_pitch": TILT,
         "end_velocity": VELOCITY, "deadline": Limit(0.0, 1e12, "s")},
 }
 """Limits by type of value and field; fields that are None are not checked."""

@@ -63,8 +63,11 @@ def check(recording: Recording, events: Iterator[Event] | None = None) -> Report
         check_camera(report, name, statistics, times, sensors)
     if sensors is None:
         report.add("calibration", "none: give --sensors FILE, made by `sensors.py import`", warning=True)
-    elif len(times) > 10 and np.ptp(times) > 0 and sensors.imu is not None:
-        check_clocks(report, recording, times, imu, sensors, sensors.imu.R_BI)
+    elif sensors.imu is not None:
+        good = np.isfinite(imu).all(axis=1)
+        times, first = np.unique(times[good], return_index=True)
+        if len(times) > 10:
+            check_clocks(report, recording, times, imu[good][first], sensors, sensors.imu.R_BI)
     return report
 
 
@@ -75,13 +78,16 @@ class ImageStatistics:
         self.delays: list[int] = []
         self.sizes: set[tuple[int, int]] = set()
         self.samples: list[tuple[float, ...]] = []
+        self.unreadable = 0  # sampled images without pixels
         self._every = max(1, total // SAMPLED_IMAGES)
 
     def add(self, image: CameraImage, arrived: int | None = None) -> None:
         """Add an image and the time of its recording [ns], if that is known."""
         if len(self.stamps) % self._every == 0:
             pixels = image.pixels()
-            if pixels is not None:
+            if pixels is None:
+                self.unreadable += 1
+            else:
                 self.sizes.add((pixels.shape[1], pixels.shape[0]))
                 self.samples.append(measure_image(pixels))
         self.stamps.append(image.stamp)
@@ -116,6 +122,9 @@ def check_camera(report: Report, name: str, statistics: ImageStatistics, imu_sta
     if not statistics.samples:
         report.add(about, "no image could be decoded", fails=True)
         return
+    if statistics.unreadable:
+        sampled = statistics.unreadable + len(statistics.samples)
+        report.add(f"{about} files", f"{statistics.unreadable} of {sampled} sampled images could not be decoded", warning=True)
     if len(imu_stamps):
         if not (np.diff(stamps) > 0).all():
             report.add(f"{about} stamps", f"{int((np.diff(stamps) <= 0).sum())} are not newer than the one before", warning=True)

@@ -195,13 +195,15 @@ def stretches_at_rest(stamps: np.ndarray, imu: np.ndarray) -> list[tuple[int, in
     limit, shaking = np.repeat(STILL_MEAN, 3), np.repeat(STILL_SIGMA, 3)
     quiet = np.array([len(part) > 3 and bool((part.std(axis=0) < shaking).all()) for part in parts])
     means = np.array([part.mean(axis=0) if len(part) else np.full(6, np.nan) for part in parts])
-    found, begin = [], 0
+    found, begin, total = [], 0, np.zeros(6)  # sum of the means from `begin` on
     for k in range(len(parts) + 1):
-        same = k < len(parts) and quiet[k] and (k == begin or bool((np.abs(means[k] - means[begin:k].mean(axis=0)) < limit).all()))
+        same = k < len(parts) and quiet[k] and (k == begin or bool((np.abs(means[k] - total / (k - begin)) < limit).all()))
         if not same:
             if k > begin:
                 found.append((int(edges[begin]), int(edges[k])))
-            begin = k if k < len(parts) and quiet[k] else k + 1
+            begin, total = (k if k < len(parts) and quiet[k] else k + 1), np.zeros(6)
+        if begin <= k < len(parts):
+            total = total + means[k]
     return found
 
 

@@ -106,7 +106,7 @@ class BagRecording(Recording):
         sources = {topic: name for name, topic in self._cameras.items()}
         if self._imu:
             sources[self._imu] = IMU
-        unusable: Counter[tuple[str, str]] = Counter()
+        unusable: dict[str, Counter[str]] = {}  # topic -> reasons, which may quote sizes
         self.damage = self._truncation
         with self._open() as reader:
             messages = reader.messages([c for c in reader.connections if c.topic in sources])
@@ -117,13 +117,14 @@ class BagRecording(Recording):
                 except StopIteration:
                     break
                 except PerchError as error:
-                    unusable[connection.topic, str(error)] += 1
+                    unusable.setdefault(connection.topic, Counter())[str(error)] += 1
                     continue
                 except Exception as error:  # whatever the libraries make of a damaged file
                     self.damage = f"{type(error).__name__}: {error}"
                     break
                 yield Event(sources[connection.topic], value, arrived)
-        texts = [f"{n} of {self._counts[topic]} messages of {topic} cannot be used: {error}" for (topic, error), n in unusable.most_common(1)]
+        texts = [f"{reasons.total()} of {self._counts[topic]} messages of {topic} cannot be used: {reasons.most_common(1)[0][0]}"
+                 for topic, reasons in unusable.items()]
         self.damage = "; ".join(filter(None, [*texts, self.damage]))
 
     def poses(self, topic: str) -> list[tuple[Any, ...]]:

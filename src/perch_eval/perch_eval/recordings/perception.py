@@ -20,7 +20,7 @@ from perch_eval.recordings.recording import Event
 from perch_perception.camera_component import CameraComponent
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.line_mapping import detect_lines
-from perch_perception.images import mono_image, rgb_image
+from perch_perception.images import ImageError, mono_image
 from perch_perception.powerline_mapper import PowerlineMapper
 from perch_perception.target_localizer import TargetLocalizer
 from perch_perception.vio import VioResult
@@ -73,10 +73,11 @@ class _Target(TargetLocalizer):
         (self.missed if sighting.pose_camera is None else self.found).offer(image.stamp, lambda: self._drawn(image, sighting))
 
     def _drawn(self, image: CameraImage, sighting: TargetSighting) -> GalleryImage | None:
-        if image.pixels() is None:
-            return None
         camera = self.mounted.known.camera
-        drawn = canvas(mono_image(image, camera))
+        try:
+            drawn = canvas(mono_image(image, camera))
+        except ImageError:  # the node has reported it
+            return None
         text = sighting.message
         if sighting.pose_camera is not None:
             draw_board(drawn, camera, load_board(self.config.board), sighting.pose_camera, sighting.ids)
@@ -95,11 +96,11 @@ class _Wires(PowerlineMapper):
         self.gallery.offer(image.stamp, lambda: self._drawn(image))
 
     def _drawn(self, image: CameraImage) -> GalleryImage | None:
-        if image.pixels() is None:
-            return None
         camera = self.mounted.known.camera
-        pixels = rgb_image(image, camera) if self.config.detection.appearance == "red" else mono_image(image, camera)
-        wires = detect_lines(pixels, camera, self.config.detection)
+        try:
+            wires = detect_lines(self._pixels(image, camera), camera, self.config.detection)
+        except ImageError:  # the node has reported it
+            return None
         drawn = canvas(mono_image(image, camera))
         draw_wires(drawn, camera, wires)
         return caption(drawn, f"{len(wires)} wires")

@@ -6,6 +6,7 @@ ASL: `mav0/cam0/data.csv`, `mav0/imu0/data.csv`, `sensor.yaml` beside each.
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import cache
@@ -206,11 +207,26 @@ class AslRecording(Recording):
         return next((file for file in files if file.is_file() and file.stat().st_size > 1000), None)
 
     def events(self) -> Iterator[Event]:
-        """Yield events in the order of their stamps, to `IMU_TAIL` after the last image; at equal stamps, IMU samples come first."""
-        cameras, last = self.sensors.cameras if self.sensors is not None else {}, self._frames[-1][0] + IMU_TAIL
+        """Yield events in the order of their stamps, to `IMU_TAIL` after the last image; at equal stamps, IMU samples come first.
+
+        Images are left out and reported in `damage` if their file is missing or, without a calibration, cannot be decoded.
+        """
+        last, bad = self._frames[-1][0] + IMU_TAIL, list[Path]()
         samples = takewhile(lambda event: event.value.stamp <= last, map(self._sample, range(len(self._stamps))))
-        frames = (Event(name, picture(path, stamp, name, cameras.get(name))) for stamp, name, path in self._frames)
-        yield from merge(samples, frames, key=lambda event: event.value.stamp)
+        yield from merge(samples, self._pictures(bad), key=lambda event: event.value.stamp)
+        self.damage = f"{len(bad)} of {len(self._frames)} image files are missing or cannot be decoded, the first: {bad[0]}" if bad else ""
+
+    def _pictures(self, bad: list[Path]) -> Iterator[Event]:
+        """Yield the images in the order of their stamps; add the files that are left out to `bad`."""
+        cameras = self.sensors.cameras if self.sensors is not None else {}
+        for stamp, name, path in self._frames:
+            try:
+                if os.path.isfile(path):  # False also for a name that no file can have
+                    yield Event(name, picture(path, stamp, name, cameras.get(name)))
+                    continue
+            except RecordingError:
+                pass
+            bad.append(path)
 
     def _sample(self, k: int) -> Event:
         stamp, row = int(self._stamps[k]), self._imu[k].tolist()
@@ -222,9 +238,10 @@ def _frames(path: Path) -> list[tuple[int, str]]:
     rows = []
     for line in rows_of(path):
         stamp, _, name = line.partition(",")
-        if not stamp.strip().isdigit():
+        digits = stamp.strip()
+        if not digits.isdecimal() or len(digits) > 19 or int(digits) > np.iinfo(np.int64).max:  # int() takes up to 4300 digits
             raise RecordingError(f"{path}: {stamp[:40]!r} is no stamp in nanoseconds")
-        rows.append((int(stamp), name.strip() or f"{stamp.strip()}.png"))
+        rows.append((int(digits), name.strip() or f"{digits}.png"))
     return rows
 
 

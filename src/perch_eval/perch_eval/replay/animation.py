@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from perch_core import so3
 from perch_core.errors import PerchError
+from perch_eval.camera_clip import CAMERAS
 from perch_eval.campaign.progress import with_progress
 from perch_eval.flight_view import ESTIMATE, LIMIT, REFERENCE, TRUTH, FlightView
 from perch_eval.metrics import tilt_degrees
@@ -23,6 +24,7 @@ from perch_eval.replay.stroboscope import Observer, draw_place, draw_vehicle
 
 DPI = 80
 CODECS = ("vp09", "mp4v")  # browsers play the first, older players the second
+IMAGES = "camera_{}/image_raw/compressed"  # channel of the images of a camera
 
 
 class Scene:
@@ -35,7 +37,8 @@ class Scene:
             start, end: time span of the animation [s].
         """
         self._view, self._start = view, start
-        self._camera = view.flight.values("camera_front/image_raw/compressed")
+        self._camera = next((name for name in CAMERAS if view.flight.values(IMAGES.format(name))), "")
+        self._images = view.flight.values(IMAGES.format(self._camera))
         self._inside = (view.truth.t >= start) & (view.truth.t <= end)
         self.figure = Figure(figsize=(10.0, 5.4), layout="constrained")
         grid = self.figure.add_gridspec(3, 3)
@@ -78,7 +81,7 @@ class Scene:
         self._image.set_xticks([])
         self._image.set_yticks([])
         self._shown = self._image.imshow(np.zeros((480, 640), np.uint8), cmap="gray", vmin=0, vmax=255)
-        self._image.set_title("front camera" if self._camera else "no camera images recorded", fontsize=8)
+        self._image.set_title(f"{self._camera} camera" if self._camera else "no camera images recorded", fontsize=8)
 
     def draw(self, time: float) -> None:
         """Show the flight at a time [s]."""
@@ -97,7 +100,7 @@ class Scene:
         self._space.set_title(f"t = {time:.2f} s   {speed:.1f} m/s   tilt {tilt_degrees(now.q)[0]:.0f} deg", fontsize=10)
 
     def _show_image(self, time: float) -> None:
-        images = [image for t, image in self._camera if t <= time]
+        images = [image for t, image in self._images if t <= time]
         if images:
             pixels = images[-1].pixels()
             if pixels is not None:

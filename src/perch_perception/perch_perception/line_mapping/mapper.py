@@ -21,7 +21,7 @@ from perch_perception.pose_buffer import BodyState
 BASELINE = 0.03  # motion between the sightings kept [m]
 TURN = 3.0  # or rotation between them [deg]
 MAX_OBSERVATIONS = 40  # sightings kept per wire
-FORGET_AFTER = 2.0  # a wire that was never triangulated and is not seen is dropped [s]
+FORGET_AFTER = 2.0  # a wire that was never triangulated, or is not published yet, and is not seen is dropped [s]
 STALE_AFTER, SUPERSEDED = 0.4, 0.3  # a wire not seen for so long gives way to one that is seen so close to it [s, m]
 MAX_RANGE = 8.0  # ends of wires further away are not used [m]
 STRAIGHTNESS = 0.02  # a sagging wire is cut into chords that stay within this [m]
@@ -48,7 +48,7 @@ class _Track:
     count: int = 1
     estimate: WireEstimate | None = None
     extent: tuple[float, float] | None = None
-    refusal: str = ""
+    refusal: str = "seen from one place only: move across the wire"
     attached: int = 0  # images that show it to be attached to what is beside it, less those that show it apart
 
 
@@ -95,7 +95,8 @@ class LineMapper:
         self._merge({self._tracks[index] for index in changed})
         self._supersede(time)
         self._tracks = [t for t in self._tracks if time - t.last.time <= FORGET_AFTER
-                        or t.estimate is not None and t.attached < ATTACHED_COUNT and _distance(t, self._body.p_WB) < FORGET_BEYOND]
+                        or t.estimate is not None and t.count >= MIN_OBSERVATIONS and t.attached < ATTACHED_COUNT
+                        and _distance(t, self._body.p_WB) < FORGET_BEYOND]
         return self.map(time)
 
     def _count_attached(self, seen: Sequence[LineObservation], owners: Sequence[int | None],

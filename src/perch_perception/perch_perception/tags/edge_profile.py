@@ -29,9 +29,9 @@ def sample_profiles(image: np.ndarray, points: np.ndarray, normals: np.ndarray, 
         origin: column and row of the first pixel of `image` in the camera's image.
     """
     x, y = ((points[..., None, k] + s * normals[..., None, k]).astype(np.float32) - np.float32(origin[k]) for k in (0, 1))
-    shape = x.shape
-    values = cv2.remap(image, x.reshape(-1, shape[-1]), y.reshape(-1, shape[-1]), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return values.reshape(shape).astype(float)
+    flat = len(x), -1  # a row for each tag: OpenCV takes up to 32767 rows and columns
+    values = cv2.remap(image, x.reshape(flat), y.reshape(flat), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return values.reshape(x.shape).astype(float)
 
 
 def gradient_centroid(s: np.ndarray, profiles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

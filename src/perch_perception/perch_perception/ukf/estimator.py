@@ -70,7 +70,7 @@ class Estimator:
             row = self._imu.latest
             kernels.advance(self._x, row[1], row[2], row[3], row[4], row[5], row[6], row[0])
             self._lag += 1
-            if self._lag >= COVARIANCE_STRIDE:
+            if self._lag >= COVARIANCE_STRIDE or outcome is ImuOutcome.GAP:  # after which the covariance is another one
                 self._refresh()
                 self._rest()
         while self._waiting and self._waiting[0].stamp <= self._imu.newest.stamp:

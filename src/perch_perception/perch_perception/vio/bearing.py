@@ -96,13 +96,10 @@ def _linearise(R_WB, p_WB, X_W, R_BC, p_BC, b_C, shape, r, J, cosine, distance):
         radius = shape[n, 1] * theta  # the lens's shape hardly changes over a residual
         x, y = radius * cx, radius * cy
         out, side = shape[n, 0], rho / radius if rho > 1e-9 else 1.0
-        # e1 orthogonal to b, from the axis that is not near it; e2 = b x e1
-        first = abs(b[0]) < 0.7
-        a0, a1 = (1.0, 0.0) if first else (0.0, 1.0)
-        e[0], e[1], e[2] = -b[2] * a1, b[2] * a0, b[0] * a1 - b[1] * a0
-        length = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
-        for i in range(3):
-            e[i] /= length
+        # e1, e2: the axes of the image, turned as the optical axis is turned onto b, so that they keep their direction along a track,
+        # as its random walk does (`sliding`); e2 = b x e1
+        w = b[0] / (1.0 + b[2])
+        e[0], e[1], e[2] = 1.0 - w * b[0], -w * b[1], -b[0]
         for row in range(2):
             if row == 1:
                 e0, e1, e2 = b[1] * e[2] - b[2] * e[1], b[2] * e[0] - b[0] * e[2], b[0] * e[1] - b[1] * e[0]

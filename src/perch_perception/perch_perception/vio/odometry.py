@@ -111,6 +111,16 @@ class VisualInertialOdometry:
         """Whether there has been an IMU sample."""
         return self._imu.last is not None
 
+    def has_left_start_before(self, stamp: int) -> bool:
+        """Whether the vehicle has left the configured start, by samples that all precede a stamp [ns]."""
+        last = self._imu.last  # None: no sample since `forget_start` could be used
+        return not self._at_configured_start and (last is None or last.stamp < stamp)
+
+    def forget_start(self, stamp: int) -> None:
+        """Take position and heading for unknown, of a vehicle that may be in motion at a stamp [ns]; call it before the first sample."""
+        self._last_pose.forget()
+        self._last_pose.known_at, self._at_configured_start = (stamp, 0.0), False
+
     @property
     def gyro_sigma(self) -> float:
         """1 sigma of the newest gyro sample [rad/s]."""

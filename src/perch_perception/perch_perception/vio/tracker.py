@@ -106,8 +106,8 @@ class Tracker:
         self._reference: np.ndarray | None = None
         self._origins: dict[int, np.ndarray] = {}  # pixels of features in the reference frame
         self._pixels, self._ids, self._next = np.zeros((0, 2), np.float32), np.zeros(0, int), 0
-        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        rays = camera.unproject(np.stack([u, v], axis=-1)[::4, ::4].astype(float))
+        u, v = np.meshgrid(np.arange(0.0, camera.width, 4.0), np.arange(0.0, camera.height, 4.0))
+        rays = camera.unproject(np.stack([u, v], axis=-1))
         # beyond its calibration a lens has no rays: 4 px of the grid, and `_REACH`
         in_view, has_ray = (cv2.resize(part.astype(np.uint8) * 255, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
                             for part in (np.nan_to_num(rays[..., 2], nan=-1.0) > np.cos(_VIEW), np.isfinite(rays[..., 2])))

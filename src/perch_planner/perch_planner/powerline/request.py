@@ -9,6 +9,7 @@ import numpy as np
 from perch_core import so3
 from perch_core.errors import PerchError, PlanningRefusal
 from perch_core.lines import Segment, perch_normal
+from perch_core.values.limits import TILT
 
 E3 = np.array([0.0, 0.0, 1.0])
 
@@ -61,7 +62,7 @@ class PerchPose:
         Raises:
             PlanningRefusal: pitch out of range, not finite, or a vertical line.
         """
-        if not 0.0 <= pitch <= np.pi + 1e-9:
+        if TILT.problem(pitch):
             raise PlanningRefusal("bad_input", "perch pitch", -1.0, f"perch pitch {pitch:g} rad is outside [0, pi]")
         grip = line.closest_point(np.array(point, float))
         try:
