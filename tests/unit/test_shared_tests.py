@@ -18,7 +18,7 @@ FILES = ["tests/nodes/test_a.py", "tests/nodes/test_b.py", "tests/recordings/tes
 
 def test_files_that_share_what_is_dear_to_make_stay_together_and_the_longest_are_first():
     assert script.parts(FILES) == [
-        ("tests/system/test_restart.py",), ("tests/nodes/",), ("tests/recordings/",), ("tests/system/test_campaign.py",),
+        ("tests/system/test_restart.py",), ("tests/recordings/",), ("tests/nodes/",), ("tests/system/test_campaign.py",),
         ("tests/system/test_e.py",), ("tests/unit/test_g.py",), ("tests/unit/test_h.py",)]
 
 
