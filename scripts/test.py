@@ -139,8 +139,11 @@ class WorkerPlugin:
                 self._others, self._forked = [], True
                 break
             self._others.append((pid, output))
+        found: dict[str, list] = {}  # tests by file
+        for item in session.items:
+            found.setdefault(item.nodeid.split("::")[0], []).append(item)
         while (part := self.next_part()) is not None:
-            items = [item for item in session.items if any(within(name, item.nodeid.split("::")[0]) for name in part)]
+            items = [item for file, some in found.items() if any(within(name, file) for name in part) for item in some]
             for item, following in zip(items, [*items[1:], None]):
                 item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
                 if session.shouldstop:
