@@ -22,7 +22,7 @@ def test_what_was_found_stays_mended(case):
     replay(case.read_text())
 
 
-@pytest.mark.parametrize("task, count", [("goal", 3), ("depart", 1), ("set_controller", 2), ("abort", 1), ("parameters", 3)])
+@pytest.mark.parametrize("task, count", [("goal", 5), ("depart", 1), ("set_controller", 3), ("abort", 1), ("parameters", 6)])
 def test_every_request_is_answered_in_sense(task, count):
     rng = random.Random(task)
     assert {ask(None, task, rng.randrange(2**31)) for _ in range(count)} <= {"taken", "refused"}

@@ -12,7 +12,7 @@ from perch_control.allocation import allocate, mixing_columns
 from perch_core.vehicle import load_vehicle
 
 VEHICLES = {name: load_vehicle(name) for name in ("snapdragon", "rpg")}
-many = settings(max_examples=80)
+many = settings(max_examples=150)
 
 
 def lexicographic(B, wrench, lo, hi, free):
