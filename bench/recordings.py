@@ -124,7 +124,9 @@ V101 = """
 At rest a tilt cannot be distinguished from the accelerometer's bias."""
 RACING = """
 **Racing motion, rendered.** UZH-FPV's truth, our camera with errors of calibration as in all our flights, our IMU. Until the take-off the
-drone stands still, where the truth jitters by millimetres; the floor is 1 m below that place.
+drone stands still, where the truth jitters by millimetres; the floor is 1 m below that place. The IMU's noise decides: with that of its
+data sheet alone, without the vibration of rotors (accelerometer 0.003 instead of 0.015 m/s^2/sqrt(Hz), gyro 1.7e-4 instead of 5e-4, as
+drawn and as declared), the errors are 0.06 to 0.43 %, median 0.17 %, and 11 of 15 hold (974f4b0a).
 """
 TAGS = """
 The whole sequences are not to be had here. For comparison, OpenVINS with one camera has an ATE of 7.6 cm and 0.64 deg on the whole of

@@ -18,18 +18,18 @@ from perch_setup import EXTRAS, ROOT, command_parser, enter, leave_quietly_on_in
 from perch_setup.enter import INTERRUPTED
 
 PARTS = (
+    ("tests/system/test_restart.py", "tests/unit/test_autopilot_firmware.py", "tests/system/test_scripts_graph.py", "tests/unit/test_autopilot_links.py",
+     "tests/unit/test_autopilot_start.py", "tests/unit/test_eval_mission_client.py"),
     ("tests/system/test_flight_surface.py",), ("tests/system/test_two_vehicles.py", "tests/unit/test_goals_in_a_row.py"),
-    ("tests/system/test_restart.py",), ("tests/nodes/",), ("tests/unit/test_autopilot_firmware.py",),
-    ("tests/recordings/",), ("tests/system/test_bad_input.py",), ("tests/system/test_campaign.py",),
-    ("tests/fuzz/test_messages.py", "tests/fuzz/test_services.py"), ("tests/unit/test_types.py",),
-    ("tests/system/test_scripts_graph.py", "tests/unit/test_autopilot_links.py", "tests/unit/test_autopilot_start.py",
-     "tests/unit/test_eval_mission_client.py"), ("tests/unit/test_vio_component.py",),
+    ("tests/recordings/",), ("tests/nodes/",), ("tests/system/test_bad_input.py",), ("tests/system/test_campaign.py",),
+    ("tests/fuzz/test_messages.py", "tests/fuzz/test_services.py"), ("tests/unit/test_types.py",), ("tests/unit/test_vio_component.py",),
     ("tests/unit/test_vio_filter.py",), ("tests/unit/test_vio_images.py",), ("tests/unit/test_vio_rest.py",), ("tests/unit/test_control_nmpc.py",),
     ("tests/unit/test_eval_replay.py", "tests/unit/test_eval_compare.py"),
 )
 """The longest parts, which start first; each other file is a part.
 
-Files and folders of one part share expensive fixtures or, where they wait for clocks and processes, leave the cores to the other processes.
+Files and folders of one part share expensive fixtures or, where they wait for clocks and processes, leave the cores to the other processes:
+two that wait at once would leave one idle. At the end of a part all fixtures end.
 """
 PROCESSES = 1 + min(os.cpu_count() or 1, 5)
 """One more than cores (at most 6), as some tests wait for clocks or processes; with two more, real-time tests starve."""
@@ -131,6 +131,7 @@ class WorkerPlugin:
         sys.stdout.flush()
         gc.freeze()  # memory that the collector does not traverse is not copied
         gc.enable()
+        gc.set_threshold(50_000)  # flights keep what they make: looking through it every 700 objects takes some percent of the time
         while len(self._others) < self._processes - 1:
             output = tempfile.TemporaryFile("w+", errors="replace")
             if (pid := os.fork()) == 0:
@@ -138,8 +139,11 @@ class WorkerPlugin:
                 self._others, self._forked = [], True
                 break
             self._others.append((pid, output))
+        found: dict[str, list] = {}  # tests by file
+        for item in session.items:
+            found.setdefault(item.nodeid.split("::")[0], []).append(item)
         while (part := self.next_part()) is not None:
-            items = [item for item in session.items if any(within(name, item.nodeid.split("::")[0]) for name in part)]
+            items = [item for file, some in found.items() if any(within(name, file) for name in part) for item in some]
             for item, following in zip(items, [*items[1:], None]):
                 item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
                 if session.shouldstop:

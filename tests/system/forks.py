@@ -15,10 +15,13 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import IO
+from types import SimpleNamespace
+from typing import IO, Any
+
+import pytest
 
 SCRIPTS = ("rclpy", "rclpy.action", "perch_setup", "ros_graph.commands", "numpy", "yaml")
 """What the scripts at a graph import."""
@@ -119,16 +122,24 @@ class Piped(Forked):
 
 
 def popen(command: Sequence[str], *, env: Mapping[str, str], **_: object) -> Piped:
-    """In the place of `subprocess.Popen` in `perch_eval.program`: the nodes of a stack are forked.
-
-    Where a stack starts executables is shown in `test_flight_surface.py`.
-    """
+    """In the place of `subprocess.Popen` in `perch_eval.program`."""
     words = list(command)[command.index("--") + 1 if "--" in command else 0:]
     if words[1] == "-m":
         spec = importlib.util.find_spec(words[2])
         assert spec is not None and spec.origin is not None
         words[:3] = [spec.origin]
     return Piped(NODES, words, env)
+
+
+def fork_programs(patch: pytest.MonkeyPatch, but: Collection[str] = ()) -> None:
+    """Until the end of `patch`, the nodes of stacks are forked, but for the executables named.
+
+    Where stacks start executables is shown in `test_scripts_stack.py`, `test_bad_input.py` and `test_flight_surface.py`.
+    """
+    def start(command: Sequence[str], **options: Any) -> Piped | subprocess.Popen:
+        return subprocess.Popen(command, **options) if any(Path(word).name in but for word in command) else popen(command, **options)
+
+    patch.setattr("perch_eval.program.subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": start}))
 
 
 def run(modules: Sequence[str], args: Sequence[str], timeout: float, environment: Mapping[str, str] | None = None) -> subprocess.CompletedProcess:

@@ -35,7 +35,7 @@ BLIND = SHORT.replace("target_localizer, ", "")
 
 
 class Running:
-    """A program of nodes, forked from a process that has their code; what an executable is by itself is shown in `test_flight_surface.py`."""
+    """A program of nodes, forked from a process that has their code; what an executable is by itself is shown in `test_stopping.py`."""
 
     def __init__(self, command: Sequence[str], hear: Callable[[str], None]) -> None:
         """

@@ -18,10 +18,10 @@ from perch_core.errors import ConfigError
 from perch_core.ros.node import close_nodes, connect
 from perch_eval import demo
 from perch_eval.ros.recorded_flight import RecordedFlight
+from perch_eval.stack import Stack
 from perch_sim.scenario import NODES
 from perch_eval.nodes import ALL_NODES, executable
 from perch_msgs.action import Perch
-from perch_msgs.srv import PlanPerch
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
@@ -86,7 +86,8 @@ def test_arguments_of_the_demo(arguments, words, capsys):
     assert words in error and len(error.splitlines()) == 1
 
 
-def test_a_parameter_that_a_node_refuses_is_invalid_input(tmp_path, capfd):
+def test_a_parameter_that_a_node_refuses_is_invalid_input(tmp_path, monkeypatch, capfd):
+    forks.fork_programs(monkeypatch)
     file = tmp_path / "mine.yaml"
     file.write_text(BLIND.replace("{vehicle", "{estimator: {coasting_after: 7000.0}, vehicle"))
     code = demo.main(["--scenario", str(file), "--out", str(tmp_path), "--composed", *sorted(set(ALL_NODES) - {"estimator"})])
@@ -125,7 +126,7 @@ AS_A_USER = "estimator: coasting_after: 7000 is outside (0, 3600] s"
 def test_an_executable_ends_with_one_line_and_exit_code_2(arguments, words, ros_domain):
     command = [executable("perch_perception", "estimator"), "--ros-args", *arguments]
     result = (subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE) if words == AS_A_USER else
-              forks.run(("perch_perception.estimator_node",), command, PATIENCE))
+              forks.run(forks.NODES, command, PATIENCE))
     assert result.returncode == 2
     assert words in result.stderr and result.stderr.startswith("error: ") and len(result.stderr.splitlines()) == 1
 
@@ -173,39 +174,12 @@ def asker(ros_domain, request):
     asker.close()
 
 
-def plan_request() -> PlanPerch.Request:
-    """A perch on a wall 1.7 m away, as the mission asks for it."""
-    nan = math.nan
-    request = PlanPerch.Request(impact_acceleration=nan, impact_speed_min=nan, impact_speed_max=nan, thrust_max=nan, thrust_min=nan)
-    request.start_position.z, request.target.position.x, request.target.position.z = 1.2, 1.7, 1.2
-    o = request.target.orientation
-    o.x, o.y, o.z, o.w = 0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5)
-    return request
-
-
 def spoil(message, path: str, value: float) -> None:
     """Set a field of a message by its dotted path."""
     *groups, leaf = path.split(".")
     for group in groups:
         message = getattr(message, group)
     setattr(message, leaf, value)
-
-
-@pytest.mark.parametrize("asker", [("perch_planner.perching_planner_node", "-p", "time_limit:=45.0")], indirect=True)
-def test_the_planner_refuses_numbers_that_are_none_and_goes_on_working(asker):
-    client = asker.caller.create_client(PlanPerch, "plan_perch")
-    asker.wait(client.service_is_ready)
-    for path, value in (("start_position.x", math.nan), ("start_velocity.z", math.inf), ("start_acceleration.y", math.nan),
-                        ("start_jerk.x", math.nan), ("start_yaw", math.nan), ("target.position.y", math.nan),
-                        ("target.orientation.w", math.nan), ("target.orientation.x", 3.0), ("target_velocity.x", math.nan),
-                        ("thrust_max", -1.0), ("impact_speed_max", math.inf)):
-        request = plan_request()
-        spoil(request, path, value)
-        answer = asker.result(client.call_async(request))
-        assert not answer.success and answer.error_code == PlanPerch.Response.BAD_INPUT, (path, answer.message)
-        assert any(word in answer.message for word in (str(value), f"{value:g}", "norm")), (path, answer.message)
-        assert not answer.trajectory.segments
-    assert asker.result(client.call_async(plan_request())).success
 
 
 @pytest.mark.parametrize("asker", [("perch_control.mission_node",)], indirect=True)
@@ -236,12 +210,12 @@ def test_the_mission_refuses_goals_that_are_none(asker):
 # -- a flight that is broken off -------------------------------------------------------------------------------------
 
 @pytest.fixture
-def airborne(tmp_path, request):
-    """A demo that has climbed, and looks for a target, with the options that the test names as its parameter, and its nodes by name."""
+def airborne(tmp_path):
+    """A demo that has climbed, and looks for a target, with all nodes in one process; and the processes that it has started."""
     file = tmp_path / "blind.yaml"
     file.write_text(BLIND)
     process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "perch_eval.demo", "--scenario", str(file), "--out", str(tmp_path), *request.param], env=dict(os.environ),
+        [sys.executable, "-u", "-m", "perch_eval.demo", "--scenario", str(file), "--out", str(tmp_path), "--composed"], env=dict(os.environ),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         for line in process.stdout:
@@ -249,10 +223,7 @@ def airborne(tmp_path, request):
                 break
         else:
             raise AssertionError(process.stderr.read())
-        nodes = {}
-        for child in psutil.Process(process.pid).children(recursive=True):
-            nodes |= {Path(word).name: child for word in child.cmdline() if "/install/" in word}
-        yield process, nodes
+        yield process, psutil.Process(process.pid).children(recursive=True)
     finally:
         process.kill()
         process.communicate()
@@ -264,13 +235,24 @@ def check_recording(folder: Path) -> None:
     assert len(flight.states("ground_truth/odometry").t) > 100 and len(flight.values("imu/data_raw")) > 100
 
 
-@pytest.mark.parametrize("airborne", [["--composed", *sorted(set(ALL_NODES) - {"target_localizer"})]], indirect=True, ids=["one alone"])
-def test_a_killed_node_ends_the_flight_and_is_named(airborne, tmp_path):
-    process, nodes = airborne
-    nodes["target_localizer"].kill()
-    out, error = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, error) == (1, "")
-    assert "target_localizer ended: killed by SIGKILL" in out
+def test_a_killed_node_ends_the_flight_and_is_named(tmp_path, undrawn, monkeypatch, capfd):
+    """In this process, which hears what the demo prints; the nodes are forked."""
+    forks.fork_programs(monkeypatch)
+    stacks, nodes, heard = [], {}, []
+
+    def hear(*words, **_):
+        heard.append(" ".join(words))
+        if "searching" in heard[-1] and not nodes:
+            nodes.update({name: psutil.Process(pid) for name, pid in stacks[0].pids.items()})
+            nodes["target_localizer"].kill()
+
+    monkeypatch.setattr(demo, "Stack", lambda *arguments, **options: stacks.append(Stack(*arguments, **options)) or stacks[-1])
+    monkeypatch.setattr(demo, "print", hear, raising=False)
+    file = tmp_path / "blind.yaml"
+    file.write_text(BLIND)
+    code = demo.main(["--scenario", str(file), "--out", str(tmp_path), "--composed", *sorted(set(ALL_NODES) - {"target_localizer"})])
+    assert (code, capfd.readouterr().err) == (1, "")
+    assert set(nodes) == {"composed", "target_localizer"} and "target_localizer ended: killed by SIGKILL" in "\n".join(heard)
     assert not any(node.is_running() for node in nodes.values())
     check_recording(tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
@@ -278,14 +260,13 @@ def test_a_killed_node_ends_the_flight_and_is_named(airborne, tmp_path):
     assert "target_localizer ended" in (tmp_path / "report.html").read_text()
 
 
-@pytest.mark.parametrize("airborne", [["--composed"]], indirect=True, ids=["composed"])
 def test_an_interrupted_flight_leaves_nothing_running(airborne, tmp_path):
-    process, nodes = airborne
-    assert set(nodes) == {"composed"}
+    process, started = airborne
+    assert any("composed" in map(os.path.basename, child.cmdline()) for child in started)
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=PATIENCE)
     assert (process.returncode, error) == (130, "interrupted; all nodes are stopped\n")
-    assert not any(node.is_running() for node in nodes.values())
+    assert not any(child.is_running() for child in started)
     logs = [log.read_text() for log in (tmp_path / "logs").glob("*.log")]
     assert logs and "Traceback" not in "".join(logs)
     check_recording(tmp_path)

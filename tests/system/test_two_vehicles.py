@@ -7,12 +7,10 @@ map is made from the truth, and stays as it is. That engines agree on images is 
 from __future__ import annotations
 
 import re
-import subprocess
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from closed_loop.perched import SEEDS, Perched, perched
@@ -65,7 +63,7 @@ def flights(tmp_path_factory) -> tuple[dict[str, FlightResult], set[str], Path]:
     folder = tmp_path_factory.mktemp("two")
     with pytest.MonkeyPatch.context() as patch, reserved_domain() as domain, ExitStack() as running:
         patch.setenv("ROS_DOMAIN_ID", str(domain))
-        patch.setattr("perch_eval.program.subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": forks.popen}))
+        forks.fork_programs(patch)
         both = {namespace: running.enter_context(vehicle(namespace, folder / namespace.strip("/"))) for namespace in SCENARIOS}
         for stack, pilot in both.values():
             stack.wait_until_ready(pilot.visible_nodes, PATIENCE)

@@ -234,9 +234,10 @@ def test_mp4_needs_no_other_program(recorded, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["f.gif", "f.mp4", "f.png"])
-def test_a_picture_that_cannot_be_written_to_its_end_is_refused_and_the_one_before_is_kept(recorded, tmp_path, capsys, name):
-    """A limit on the size of files stands for a full disk, which OpenCV does not report."""
+def test_a_picture_that_cannot_be_written_to_its_end_is_refused_and_the_one_before_is_kept(recorded, tmp_path, capsys, monkeypatch, name):
+    """A limit on the size of files stands for a full disk, which OpenCV does not report. Animations show noise, which is drawn at once."""
     path, _ = recorded
+    monkeypatch.setattr(animation, "_frames", lambda scene, times: np.random.default_rng(1).integers(0, 256, (len(times), 240, 320, 3), np.uint8))
     options = [str(path), "--from", "1.2", "--to", "1.4", "--fps", "10", "--out", str(tmp_path / name)]
     (tmp_path / name).write_text("before")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -18,7 +18,7 @@ FILES = ["tests/nodes/test_a.py", "tests/nodes/test_b.py", "tests/recordings/tes
 
 def test_files_that_share_what_is_dear_to_make_stay_together_and_the_longest_are_first():
     assert script.parts(FILES) == [
-        ("tests/system/test_restart.py",), ("tests/nodes/",), ("tests/recordings/",), ("tests/system/test_campaign.py",),
+        ("tests/system/test_restart.py",), ("tests/recordings/",), ("tests/nodes/",), ("tests/system/test_campaign.py",),
         ("tests/system/test_e.py",), ("tests/unit/test_g.py",), ("tests/unit/test_h.py",)]
 
 
@@ -70,7 +70,7 @@ SKIPPED = "import pytest\npytest.skip('{0}', allow_module_level=True)"
 
 
 @pytest.mark.parametrize("contents, code, words", [
-    ((GOOD,) * 9, 0, {"passed": 9}), ((GOOD, SKIPPED), 0, {"passed": 1, "skipped": 2}), ((BAD, GOOD), 1, {"failed": 1, "passed": 1}),
+    ((*(GOOD,) * 9, SKIPPED), 0, {"passed": 9, "skipped": 2}), ((BAD, GOOD), 1, {"failed": 1, "passed": 1}),
     ((GOOD, BROKEN, GOOD), 1, {"error": 1}), ((CRASHED, CRASHED), 1, {"passed": 1}), ((STOPPED, STOPPED), 130, {})])
 def test_two_processes_run_each_part_once_and_whatever_fails_is_told(contents, code, words, tmp_path):
     """Both have collected what is skipped as a file."""
