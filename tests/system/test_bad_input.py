@@ -211,7 +211,7 @@ def test_the_mission_refuses_goals_that_are_none(asker):
 
 @pytest.fixture
 def airborne(tmp_path):
-    """A demo that has climbed, and looks for a target, with all nodes in one process; and the processes that it has started."""
+    """A demo that has climbed, and looks for a target, with all nodes in one process; and its nodes by name."""
     file = tmp_path / "blind.yaml"
     file.write_text(BLIND)
     process = subprocess.Popen(
@@ -223,7 +223,10 @@ def airborne(tmp_path):
                 break
         else:
             raise AssertionError(process.stderr.read())
-        yield process, psutil.Process(process.pid).children(recursive=True)
+        nodes = {}
+        for child in psutil.Process(process.pid).children(recursive=True):
+            nodes |= {Path(word).name: child for word in child.cmdline() if "/install/" in word}
+        yield process, nodes
     finally:
         process.kill()
         process.communicate()
@@ -261,12 +264,12 @@ def test_a_killed_node_ends_the_flight_and_is_named(tmp_path, undrawn, monkeypat
 
 
 def test_an_interrupted_flight_leaves_nothing_running(airborne, tmp_path):
-    process, started = airborne
-    assert any("composed" in map(os.path.basename, child.cmdline()) for child in started)
+    process, nodes = airborne
+    assert set(nodes) == {"composed"}
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=PATIENCE)
     assert (process.returncode, error) == (130, "interrupted; all nodes are stopped\n")
-    assert not any(child.is_running() for child in started)
+    assert not any(node.is_running() for node in nodes.values())
     logs = [log.read_text() for log in (tmp_path / "logs").glob("*.log")]
     assert logs and "Traceback" not in "".join(logs)
     check_recording(tmp_path)

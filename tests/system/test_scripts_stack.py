@@ -12,7 +12,7 @@ from contextlib import suppress
 import psutil
 import pytest
 from perch_eval.domain import reserved_domain
-from system.scripts import PATIENCE, call_script, fork_script, start_script
+from system.scripts import PATIENCE, call_script, fork_script, run_script, start_script
 
 NODES = ("estimator", "controller")  # they wait for a vehicle that does not come: no flight is needed here
 
@@ -131,7 +131,7 @@ def test_mistakes_of_the_caller_are_one_clear_line(arguments, words, tmp_path):
 
 def test_a_parameter_that_a_node_refuses_is_invalid_input(domain, tmp_path):
     """What each node refuses is shown in test_bad_input.py."""
-    result = fork_script("start_stack.py", "--only", "estimator", "-p", "estimator.coasting_after:=7000.0", "--domain", domain, "--log-dir", str(tmp_path))
+    result = run_script("start_stack.py", "--only", "estimator", "-p", "estimator.coasting_after:=7000.0", "--domain", domain, "--log-dir", str(tmp_path))
     assert result.returncode == 2
     assert "coasting_after: 7000 is outside" in result.stderr and "Traceback" not in result.stderr + result.stdout
 
@@ -141,7 +141,7 @@ def test_a_port_in_use_is_invalid_input(domain, tmp_path):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = str(taken.getsockname()[1])
-        result = fork_script("start_stack.py", "--only", "estimator", "--view", port, "--domain", domain, "--log-dir", str(tmp_path))
+        result = run_script("start_stack.py", "--only", "estimator", "--view", port, "--domain", domain, "--log-dir", str(tmp_path))
     assert result.returncode == 2 and "Traceback" not in result.stderr + result.stdout
     assert f"127.0.0.1:{port} cannot be served (Address already in use" in result.stderr and "choose another" in result.stderr
 
