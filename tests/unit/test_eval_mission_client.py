@@ -26,6 +26,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 
+pytestmark = pytest.mark.filterwarnings("ignore:failed to send response")  # of rclpy, where the pilot leaves before the mission has answered
 SCENARIO = load_scenario("surface_90")
 SILENT = "has sent no diagnostics for 0.5 s: it hangs or has ended, or the machine is overloaded"
 
