@@ -131,7 +131,6 @@ class WorkerPlugin:
         sys.stdout.flush()
         gc.freeze()  # memory that the collector does not traverse is not copied
         gc.enable()
-        gc.set_threshold(50_000)  # flights keep what they make: looking through it every 700 objects takes some percent of the time
         while len(self._others) < self._processes - 1:
             output = tempfile.TemporaryFile("w+", errors="replace")
             if (pid := os.fork()) == 0:

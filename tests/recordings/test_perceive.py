@@ -33,27 +33,20 @@ def report(folder) -> dict:
 
 @pytest.fixture(scope="module")
 def euroc(files, tmp_path_factory):
-    """What comes of a folder in which three images cannot be read; wires are looked for twice a second, and the sensors checked by few looks."""
+    """What comes of a folder in which three images cannot be read; wires are looked for twice a second."""
     folder = tmp_path_factory.mktemp("euroc")
     shutil.copytree(files / "asl", folder / "asl")
     for path in sorted((folder / "asl" / "mav0" / "cam0" / "data").iterdir())[70:73]:
         path.write_bytes(path.read_bytes()[:100])
-    with pytest.MonkeyPatch.context() as patch:
-        look_few_times(patch)
-        assert perceive(folder / "asl", "--out", folder, "-p", "powerline_mapper.rate:=2.0") == 0
+    assert perceive(folder / "asl", "--out", folder, "-p", "powerline_mapper.rate:=2.0") == 0
     return folder
-
-
-def look_few_times(patch):
-    """The checks of the sensors are those of `test_checks.py`."""
-    patch.setattr(check, "SAMPLED_IMAGES", 12)
-    patch.setattr(check, "SPAN", 4.0)
 
 
 @pytest.fixture
 def few_looks(undrawn, monkeypatch):
-    """The same for others, whose page is that of `euroc`."""
-    look_few_times(monkeypatch)
+    """The page is that of `euroc`, the checks of the sensors are those of `test_checks.py`."""
+    monkeypatch.setattr(check, "SAMPLED_IMAGES", 12)
+    monkeypatch.setattr(check, "SPAN", 4.0)
 
 
 def test_the_motion_is_found(euroc):

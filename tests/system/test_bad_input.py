@@ -22,6 +22,7 @@ from perch_eval.stack import Stack
 from perch_sim.scenario import NODES
 from perch_eval.nodes import ALL_NODES, executable
 from perch_msgs.action import Perch
+from perch_msgs.srv import PlanPerch
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
@@ -174,12 +175,39 @@ def asker(ros_domain, request):
     asker.close()
 
 
+def plan_request() -> PlanPerch.Request:
+    """A perch on a wall 1.7 m away, as the mission asks for it."""
+    nan = math.nan
+    request = PlanPerch.Request(impact_acceleration=nan, impact_speed_min=nan, impact_speed_max=nan, thrust_max=nan, thrust_min=nan)
+    request.start_position.z, request.target.position.x, request.target.position.z = 1.2, 1.7, 1.2
+    o = request.target.orientation
+    o.x, o.y, o.z, o.w = 0.0, -math.sqrt(0.5), 0.0, math.sqrt(0.5)
+    return request
+
+
 def spoil(message, path: str, value: float) -> None:
     """Set a field of a message by its dotted path."""
     *groups, leaf = path.split(".")
     for group in groups:
         message = getattr(message, group)
     setattr(message, leaf, value)
+
+
+@pytest.mark.parametrize("asker", [("perch_planner.perching_planner_node", "-p", "time_limit:=45.0")], indirect=True)
+def test_the_planner_refuses_numbers_that_are_none_and_goes_on_working(asker):
+    client = asker.caller.create_client(PlanPerch, "plan_perch")
+    asker.wait(client.service_is_ready)
+    for path, value in (("start_position.x", math.nan), ("start_velocity.z", math.inf), ("start_acceleration.y", math.nan),
+                        ("start_jerk.x", math.nan), ("start_yaw", math.nan), ("target.position.y", math.nan),
+                        ("target.orientation.w", math.nan), ("target.orientation.x", 3.0), ("target_velocity.x", math.nan),
+                        ("thrust_max", -1.0), ("impact_speed_max", math.inf)):
+        request = plan_request()
+        spoil(request, path, value)
+        answer = asker.result(client.call_async(request))
+        assert not answer.success and answer.error_code == PlanPerch.Response.BAD_INPUT, (path, answer.message)
+        assert any(word in answer.message for word in (str(value), f"{value:g}", "norm")), (path, answer.message)
+        assert not answer.trajectory.segments
+    assert asker.result(client.call_async(plan_request())).success
 
 
 @pytest.mark.parametrize("asker", [("perch_control.mission_node",)], indirect=True)

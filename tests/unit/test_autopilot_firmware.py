@@ -453,7 +453,8 @@ def body():
 
 
 @pytest.mark.parametrize("axis, tilt, rate", [
-    ((1, 0, 0), 30.0, 2.0), ((-1, 0, 0), 60.0, 4.0), ((0, -1, 0), 90.0, 0.0), ((0, 1, 0), 85.0, 6.5), ((0.6, 0.8, 0), 60.0, 4.0)])
+    ((1, 0, 0), 30.0, 2.0), ((-1, 0, 0), 60.0, 4.0), ((0, 1, 0), 60.0, 4.0), ((0, -1, 0), 90.0, 0.0), ((0.6, 0.8, 0), 45.0, 2.0),
+    ((0, 1, 0), 85.0, 6.5), ((0.6, 0.8, 0), 60.0, 4.0)])
 def test_a_body_is_level_a_third_of_a_second_after_the_last_command(body, axis, tilt, rate):
     body.found(axis, tilt, rate)
     last, told, above = body.loop.last_command, None, 0.0

@@ -14,7 +14,7 @@ from perch_perception.line_mapping import mapper as mapper_module
 from perch_perception.pose_buffer import BodyState, PoseBuffer
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(radius=st.just(0.0) | st.floats(0.001, 3.0), distance=st.floats(0.5, 40.0), seed=st.integers(0, 9))
 def test_whatever_is_seen_receivers_accept_the_map(radius, distance, seed):
     """A line that they would refuse is left out, with the reason, and does not cost them the others."""

@@ -222,7 +222,7 @@ def test_a_waypoint_that_is_given_fifty_times_is_flown_through(ask: Asked) -> No
 
 
 def test_many_waypoints_do_not_outlast_the_longest_plan(ask: Asked) -> None:
-    waypoints = np.array([[-4.0 * (k % 2), 1.5 * (k % 3), 1.4] for k in range(22)])
+    waypoints = np.array([[-4.0 * (k % 2), 1.5 * (k % 3), 1.4] for k in range(50)])
     plan = ask(request(waypoints=waypoints))
     assert plan.error_code == X and "no plan keeps the duration_max" in plan.message and "up to 20.00 s" in plan.message
     enough = planner(PerchingPlannerParameters(duration_max=0.8))(request())

@@ -546,11 +546,12 @@ def test_limits_come_from_the_vehicle_unless_they_are_set():
     assert Limits.of(PerchSettings(thrust_max=4.5), VEHICLE).thrust[1] == 4.5
 
 
+@pytest.mark.parametrize("chunk", range(2))
 @pytest.mark.slow
-def test_random_problems_end_in_verified_plans_or_typed_refusals():
+def test_random_problems_end_in_verified_plans_or_typed_refusals(chunk):
     """A slice of the campaign of 10,000 (bench/planner_campaign.py)."""
     planned = 0
-    for seed in range(50):
+    for seed in range(50 * chunk, 50 * chunk + 50):
         problem = random_problem(np.random.default_rng(seed))
         try:
             answer = plan(problem, PerchSettings(), VEHICLE)

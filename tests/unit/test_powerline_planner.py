@@ -200,8 +200,7 @@ def test_a_sagging_cable_of_segments_is_gripped_in_the_middle_and_at_a_joint(pla
     assert all(bound.holds for bound in plan.bounds)
 
 
-def test_a_perch_that_no_trajectory_reaches_is_refused_with_what_is_violated(planner: PowerlinePlanner, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "ATTEMPTS", 3)  # whatever the guess, there is none
+def test_a_perch_that_no_trajectory_reaches_is_refused_with_what_is_violated(planner: PowerlinePlanner) -> None:
     # Gaps of 0.2 m: even edge on the body needs 0.24 m. (It does slip through gaps of 0.35 m.)
     cage = tuple(Segment([2.0, 0.0, 0.5 + 0.2 * k], [0, 1, 0], 60.0, 0.03, 100 + k) for k in range(120))
     with pytest.raises(PlanningRefusal, match="no perch within the limits: clearance") as refusal:

@@ -175,7 +175,7 @@ def rest(seed, attitude, times, dark, fps=2.0, rate=100.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("attitude, dark", [("ground", False), ("wall", True), ("upside down", True)])
+@pytest.mark.parametrize("attitude, dark", [("ground", False), ("wall", True), ("upside down", False), ("upside down", True)])
 def test_rest_in_any_attitude_is_known_for_long_and_honestly(attitude, dark):
     """Minutes; what does not grow in these does not grow in an hour."""
     _, outcomes, ((_, before), (error, after)), _ = rest(1, attitude, (30.0, 120.0), dark)

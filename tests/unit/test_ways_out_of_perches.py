@@ -83,8 +83,9 @@ def test_the_last_way_out_is_as_late_as_it_may_be_unless_one_begins_just_before_
     assert WaysOut(covered, until=1.0, spacing=0.4).next(0.9) == last
 
 
-def test_a_cancelled_perch_leaves_by_a_way_out_and_ends_in_a_hover():
-    flown = fly_cancelled("surface_90", 1, 0.25)
+@pytest.mark.parametrize("before", [1.2, 0.25])
+def test_a_cancelled_perch_leaves_by_a_way_out_and_ends_in_a_hover(before):
+    flown = fly_cancelled("surface_90", 1, before)
     assert flown.planned and flown.end == "hovering" and flown.message == "cancelled; hovering"
     assert flown.rate < VEHICLE.body_rate_max and flown.margin > 0.0 and flown.distance > 0.0
 
