@@ -5,16 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 from perch_core import so3
-from perch_core.values import ImuSample
+from perch_core.covariance import largest_sigma
+from perch_core.values import ImuSample, InertialState, limits
 from perch_core.vehicle import load_vehicle
 from unit.simulated_tracks import Tracks, Truth, bounds
 from perch_perception.ukf.imu_buffer import ImuBuffer
+from perch_perception.ukf.odometry import state_of
 from perch_perception.vio import VioConfig
 from perch_perception.vio import state as at
 from perch_perception.vio.bearing import observe
+from perch_perception.vio.last_pose import LastPose
 from perch_perception.vio.motion_start import MotionStart
+from perch_perception.vio.odometry import _estimate
 from perch_perception.vio.preintegration import preintegrate
-from perch_perception.vio.start import add_heading_by_bias, at_rest, configured_pose, initial_state
+from perch_perception.vio.start import POSE_ROWS, add_heading_by_bias, at_rest, configured_pose, initial_state
 
 MOUNT = load_vehicle("snapdragon").mounts["down"]
 RATE, FRAMES, NOISE = 200.0, 20.0, 0.3
@@ -102,6 +106,23 @@ def test_a_heading_that_the_gyro_has_propagated_has_the_errors_of_its_bias_and_n
     up_B, u = pose.R_WB[2], pose.heading_by_bias
     assert up_B @ (state.P - before)[at.THETA, at.THETA] @ up_B == pytest.approx(25e-6 * u @ u) and u @ u > 20.0
     np.testing.assert_allclose(state.P[at.THETA, at.GYRO_BIAS], 25e-6 * np.outer(up_B, u))
+
+
+@pytest.mark.parametrize("losses", [1, 200])
+def test_a_start_after_losses_of_any_length_is_accepted_by_those_who_receive_it(losses):
+    """A vehicle that was fast for 1000 s without a filter may be anywhere: its sigma grows to 1 km and no further."""
+    imu, last = ImuBuffer(CONFIG.imu, 2.5), LastPose(configured_pose(np.zeros(3), 0.0))
+    for loss in range(losses):
+        now = (loss + 1) * 1_000_000_000_000
+        imu.add(ImuSample(now, (0.0,) * 3, (0.0, 0.0, 9.81)))
+        last.known_at = now - 1_000_000_000_000, 25.0
+        state = initial_state(CONFIG, MOUNT, now, np.eye(3), last.pose, np.zeros(3), np.zeros(3), 0.01, 0.1, 5e-3)
+        last.propagate_position(state, imu)
+        assert largest_sigma(state.P[at.POSITION, at.POSITION]) == pytest.approx(1000.0)
+        last.pose = dataclasses.replace(last.pose, covariance=_estimate(state).pose_covariance[POSE_ROWS])
+    e = _estimate(state)
+    value = InertialState(e.stamp, e.p_WB, so3.quat_from_matrix(e.R_WB), e.v_WB, e.gyro_bias, e.accel_bias, e.P, "odom")
+    assert limits.problem(value) == "" and state_of(value).problem() is None
 
 
 def test_starts_take_over_the_heading_with_the_error_of_its_bias():

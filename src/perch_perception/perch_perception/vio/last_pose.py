@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 from perch_core import so3
+from perch_core.covariance import largest_sigma
 from perch_perception.ukf.imu_buffer import ImuBuffer
 from perch_perception.vio import start
 from perch_perception.vio import state as at
 from perch_perception.vio.preintegration import preintegrate
 from perch_perception.vio.start import KnownPose
 
-_ANYWHERE = 1000.0  # 1 sigma of a position of which nothing is known [m]
+_ANYWHERE = 1000.0  # 1 sigma of a position of which nothing is known: none is larger, as receivers refuse such covariances [m]
 
 
 class LastPose:
@@ -58,7 +59,7 @@ class LastPose:
         self.pose = replace(self.pose, covariance=covariance)
 
     def propagate_position(self, state: at.State, imu: ImuBuffer) -> None:
-        """Propagate the position of a start in motion from where it was known."""
+        """Propagate the position of a start in motion from where it was known, with a 1 sigma of at most `_ANYWHERE`."""
         if self.known_at is None:
             return
         since, speed = self.known_at
@@ -67,4 +68,7 @@ class LastPose:
         else:  # its motion since then is unknown
             reach = 1e-9 * (state.stamp - since) * max(speed, float(np.linalg.norm(state.v_WB)))
             state.P[at.POSITION, at.POSITION] += reach**2 * np.eye(3)
+        if (excess := largest_sigma(state.P[at.POSITION, at.POSITION]) / _ANYWHERE) > 1.0:
+            state.P[at.POSITION] /= excess
+            state.P[:, at.POSITION] /= excess
         self.known_at = None
