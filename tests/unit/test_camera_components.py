@@ -304,6 +304,33 @@ def test_another_frame_is_believed_when_it_stays():
     assert mounted.mount.p_BC[0] == -0.1
 
 
+def test_images_of_another_frame_wait_for_its_transform():
+    """They are of a camera whose place is not known; with the transform they are used, with this place."""
+    bench, upright = Bench(known=False, extrinsics="tf"), (0.0, 0.0, 0.0, 1.0)
+    bench.component.on_transform(Transform("base_link", FRAME, (0.1, 0.0, 0.0), upright))
+    bench.component.on_camera_info(CameraModel(0, FRAME, CAMERA))
+    bench.odometry(0, 400)
+    bench.image(50)
+    assert len(bench.exposures) == 1
+    for k in range(5):
+        bench.component.on_camera_info(CameraModel(k, "tail", CAMERA))
+    bench.image(100, frame="tail")
+    assert len(bench.exposures) == 1 and bench.component.mounted.mount is None
+    assert "images are not used: no transform of 'tail' in base_link on /tf_static yet" in bench.out.warnings()[-1]
+    bench.component.on_transform(Transform("base_link", "tail", (-0.1, 0.0, 0.0), upright))
+    assert len(bench.exposures) == 2 and bench.component.mounted.known.p_BC[0] == -0.1
+
+
+def test_a_camera_that_is_found_again_in_its_place_is_the_same():
+    """A new tree of frames comes link by link: what was made for the camera holds."""
+    mounted, upright = MountedCamera(FRONT, False, "tf", lambda text, period: None), (0.0, 0.0, 0.0, 1.0)
+    mounted.take_transform(Transform("base_link", FRAME, (0.1, 0.0, 0.0), upright))
+    assert mounted.take_model(CameraModel(0, FRAME, CAMERA))
+    mount = mounted.mount
+    assert not mounted.take_transform(Transform("arm", FRAME, (0.0, 0.0, 0.0), upright)) and mounted.mount is None
+    assert mounted.take_transform(Transform("base_link", "arm", (0.1, 0.0, 0.0), upright)) and mounted.mount is mount
+
+
 @pytest.mark.parametrize(("cls", "parameters"), [
     (TargetLocalizer, {"camera": "tail"}), (PowerlineMapper, {"vehicle": "snapdragon"}), (PowerlineMapper, {"camera": "tail"})])
 def test_a_camera_that_cannot_be_used_is_refused_at_the_start(cls, parameters):

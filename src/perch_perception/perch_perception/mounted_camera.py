@@ -28,12 +28,14 @@ class MountedCamera:
         warn: called with a warning and the least time between two of its kind [s].
 
     Attributes:
-        mount: the camera; None until it is known. With `file` and intrinsics equal to the nominal ones it is `nominal` itself.
+        mount: the camera; None while it is not known, also where its frame has no transform. With `file` and intrinsics equal to the
+            nominal ones it is `nominal` itself.
     """
 
     def __init__(self, nominal: CameraMount, calibrated: bool, extrinsics: str, warn: Callable[[str, float], None]) -> None:
         self.nominal = nominal
         self.mount: CameraMount | None = None
+        self._last: CameraMount | None = None  # the mount known last
         self._by_transforms, self._warn = extrinsics == "tf", warn
         self._expects_frame = extrinsics == "file" and not calibrated
         self._transforms = StaticTransforms()
@@ -94,13 +96,13 @@ class MountedCamera:
         return True
 
     def _place(self) -> bool:
-        mount, last = self._mount(), self.mount
-        changed = mount is not None and (last is None or not (
-            _is_same(mount.camera, last.camera) and np.allclose(mount.p_BC, last.p_BC, 0.0, TOLERANCE)
-            and np.allclose(mount.R_BC, last.R_BC, 0.0, TOLERANCE)))
-        if changed:
-            self.mount = mount
-        return changed
+        before, mount, last = self.mount, self._mount(), self._last
+        if mount is not None and (last is None or not (
+                _is_same(mount.camera, last.camera) and np.allclose(mount.p_BC, last.p_BC, 0.0, TOLERANCE)
+                and np.allclose(mount.R_BC, last.R_BC, 0.0, TOLERANCE))):
+            self._last = mount
+        self.mount = None if mount is None else self._last
+        return self.mount is not None and self.mount is not before
 
     def _mount(self) -> CameraMount | None:
         assert self._camera is not None  # nothing is placed before its intrinsics have come
