@@ -1,5 +1,6 @@
 """The map of wires: from rendered images, its ids and extents, and what changes it."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ from perch_core import so3
 from perch_perception.line_mapping import (
     LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, WireEstimate, detect_lines, place)
 from perch_perception.line_mapping.association import meets_another
+from perch_perception.line_mapping.mapper import PIECE_IDS
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.powerline_mapper import mapping_pose
 from perch_sim.rendering import CableCurve, Renderer, Scene
@@ -260,6 +262,18 @@ def test_pieces_of_a_wire_keep_numbers_of_their_own_after_many_wires():
         body = BodyState(time, true, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
         lines = mapper.update(time, body, [observe(rng, wire, true, 2e-4, time=time) for wire in ((sagging,) if k < 20 else (sagging, straight))]).lines
     assert len(lines) >= 3 and len({line.id for line in lines}) == len(lines), [line.id for line in lines]
+
+
+def test_ids_of_wires_begin_anew_before_they_meet_those_of_pieces():
+    """After a million wires; those that the map still has are left out."""
+    mapper, rng = LineMapper(MapperConfig()), np.random.default_rng(16)
+    body = BodyState(0.0, np.zeros(3), np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.eye(6) * 1e-6)
+    for number, height in enumerate((1.0, 2.0, 3.0, 4.0)):
+        if number == 2:
+            mapper._next_id = PIECE_IDS - 1
+        wire = WireCurve(np.array([3.0, 0.0, height]), np.array([0.0, 1.0, 0.0]))
+        mapper.update(0.1 * number, replace(body, time=0.1 * number), [observe(rng, wire, np.zeros(3), time=0.1 * number)])
+    assert [track.id for track in mapper._tracks] == [0, 1, PIECE_IDS - 1, 2]
 
 
 def test_between_two_states_the_correction_is_between_theirs():

@@ -25,7 +25,7 @@ FORGET_AFTER = 2.0  # a wire that was never triangulated, or is not published ye
 STALE_AFTER, SUPERSEDED = 0.4, 0.3  # a wire not seen for so long gives way to one that is seen so close to it [s, m]
 MAX_RANGE = 8.0  # ends of wires further away are not used [m]
 STRAIGHTNESS = 0.02  # a sagging wire is cut into chords that stay within this [m]
-PIECE_IDS = 1_000_000  # ids of the pieces of wire k: k, k + 1,000,000, ...
+PIECE_IDS = 1_000_000  # ids of the pieces of wire k: k, k + 1,000,000, ...; so many wires have an id before one is used again
 ATTACHED_COUNT = 3    # surplus of images that show a line attached to the surface beside it: it is no wire
 MIN_OBSERVATIONS = 4  # fewer sightings are not published, nor called degenerate
 MAX_LINES = limits.LIMITS[PowerlineMap]["lines"].count_max  # that receivers accept
@@ -84,8 +84,7 @@ class LineMapper:
             if owner is None:
                 continue
             if owner < 0:
-                self._tracks.append(_Track(self._next_id, [one], one))
-                self._next_id += 1
+                self._tracks.append(_Track(self._free_id(), [one], one))
             elif self._extend(self._tracks[owner], one):
                 changed.add(owner)
         for index in sorted(changed):
@@ -98,6 +97,14 @@ class LineMapper:
                         or t.estimate is not None and t.count >= MIN_OBSERVATIONS and t.attached < ATTACHED_COUNT
                         and _distance(t, self._body.p_WB) < FORGET_BEYOND]
         return self.map(time)
+
+    def _free_id(self) -> int:
+        """Return the id of a new wire, below `PIECE_IDS`: the next one that no wire of the map has."""
+        used, free = {track.id for track in self._tracks}, self._next_id
+        while free in used:
+            free = (free + 1) % PIECE_IDS
+        self._next_id = (free + 1) % PIECE_IDS
+        return free
 
     def _count_attached(self, seen: Sequence[LineObservation], owners: Sequence[int | None],
                attached: Callable[[LineObservation, WireCurve], bool | None]) -> None:
