@@ -121,6 +121,7 @@ def test_the_average_of_an_image_is_taken_once_it_is_good():
     for ms in (50, 100, 150, 200):
         bench.image(ms)
     assert [one.found for one in bench.out["sighting"]] == [True] * 4 and len(bench.out["pose"]) == 1
+    assert [one.method for one in bench.out["sighting"]] == ["average"] * 4
 
 
 @pytest.mark.parametrize("given", [{"twist_covariance": np.zeros((6, 6))}, {"twist_covariance": -np.eye(6)}])

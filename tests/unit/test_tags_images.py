@@ -180,6 +180,15 @@ def test_covered_camera_ends_tracking_and_comes_back(places):
     assert all(r.board is not None for r in results[30:])
 
 
+def test_an_average_that_is_refused_leaves_the_joint_pose(places, monkeypatch):
+    place = places("surface_90")
+    p, R = np.array([0.0, 0.0, 1.2]), np.eye(3)
+    monkeypatch.setattr("perch_perception.tags.average.planar_branches", lambda points, rays: [])
+    result = BoardLocalizer(BOARD, MOUNT, averaging=True).process(place.image(p, R), 0.0)
+    assert result.complete and result.average is None and result.message == "no average: tag 0 has no pose"
+    assert place.errors(p, R, result.board)[0] < 0.01
+
+
 def test_strange_and_repeated_tags_are_named_and_not_used(places):
     place = places("surface_90")
     p, R = np.array([0.0, 0.0, 1.2]), np.eye(3)

@@ -156,7 +156,7 @@ class TargetLocalizer(PosedCameraComponent[TargetLocalizerConfig]):
             is_new = self._averaged is None and average is not None and self._is_accurate(measured.covariance)  # the first good complete image, once
             if is_new:
                 self._averaged = measured
-            elif self._averaged is None:
+            elif self._averaged is None and average is None:
                 method = "joint"  # not all tags yet: this is no average
             target = self._averaged or measured
         pose = _pose(sighting.stamp, target.p_WS, target.R_WS, target.covariance)

@@ -45,7 +45,7 @@ class Localization:
 
     Attributes:
         board: joint pose in the camera, or None.
-        average: the paper's averaged pose, where it is enabled and all tags were seen; else None.
+        average: the paper's averaged pose, where it is enabled, all tags were seen and each has a pose; else None.
         complete: all tags of the board were used.
         searched: the whole frame was searched.
         message: human-readable description of what is missing or was refused; empty otherwise.
@@ -237,7 +237,12 @@ class BoardLocalizer:
                 f"the tags' size puts the board at {distance:.2f} m, outside "
                 f"[{MIN_RANGE:g}, {self._max_range:g}] m: not a board of this size")
         complete = len(pose.ids) == len(self.board.ids)
-        average = average_board(camera, corners_S, rays, ids) if self._averaging and complete else None
+        average = None
+        if self._averaging and complete:
+            try:
+                average = average_board(camera, corners_S, rays, ids)
+            except LocalizationRefusal as refusal:
+                notes.append(f"no average: {refusal}")
         if pose.dropped:
             notes.append(f"tags {list(pose.dropped)} contradict the others")
         return Localization(pose, average, complete, searched, "; ".join(notes))
