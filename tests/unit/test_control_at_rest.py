@@ -55,6 +55,17 @@ def test_a_vehicle_that_lies_below_its_perch_is_not_started():
     assert not flight.motors[-1].armed
 
 
+def test_a_vehicle_whose_odometry_begins_anew_on_its_perch_departs_once_it_is_called_attached_again():
+    """Only people can tell that from a fall; the refusal says both."""
+    flight = attached()
+    carried(flight, (0.0, 0.0, 0.05), 180.0)
+    flight.order(Command.ARM)
+    assert flight.state is State.ATTACHED and "odometry has begun anew: command ATTACHED again" in flight.said
+    flight.order(Command.ATTACHED)
+    flight.order(Command.ARM)
+    assert flight.state is State.RECOVERING, flight.said
+
+
 @pytest.mark.parametrize("p, v", [(PERCH, (0.0, 0.0, 0.0)), ((2.0, 0.0, 0.6), (0.5, 0.0, 0.0)), ((0.0, 0.0, 0.05), (0.0, 0.0, -3.0))],
                          ids=["where it was", "carried away by the surface", "still falling"])
 def test_a_vehicle_on_its_perch_or_falling_from_it_is_started(p, v):

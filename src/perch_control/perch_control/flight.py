@@ -21,7 +21,7 @@ from perch_control.maneuvers import (
 from perch_control.modes import CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.period import MeasuredPeriod
-from perch_control.resting import check_arming, has_fallen, idling
+from perch_control.resting import FALLEN, check_arming, has_fallen, idling
 from perch_control.rotor_health import RotorHealth
 from perch_control.schedule import Schedule
 from perch_control.sensor_inputs import SensorInputs
@@ -164,7 +164,7 @@ class FlightController:
         if self._schedule.leaving(x) or x.land_requested:
             raise TrajectoryRefused("the running manoeuvre is about to be left")
         if has_fallen(x):
-            raise TrajectoryRefused("the vehicle has come off and lies below its perch; disarm first")
+            raise TrajectoryRefused(FALLEN)
         if x.mode is State.ATTACHED:
             x = self.flight_state = self._thrust.reset(x, self.law, self.compensator)
         elif x.mode is State.ARMED and problem:

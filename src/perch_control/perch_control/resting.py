@@ -16,6 +16,8 @@ _ARM_TILT = cos(radians(45.0))  # of the largest tilt at which motors start and 
 _ARM_FORCE_MIN = 0.5 * GRAVITY  # smallest specific force along b3 there [m/s^2]
 _FALLEN = 0.5                   # at rest so far below the place of ATTACHED, nothing there carries the vehicle [m]
 _FALLING = 1.0                  # faster than this it is still falling, and the motors may save it [m/s]
+FALLEN = "the vehicle has come off and lies below its perch: disarm first; or odometry has begun anew: command ATTACHED again if the vehicle still hangs"
+"""Reason of a refusal where `has_fallen`."""
 
 
 def check_arming(x: FlightState, inputs: SensorInputs, specific_thrust: float, timeout: float) -> None:
@@ -39,13 +41,16 @@ def check_arming(x: FlightState, inputs: SensorInputs, specific_thrust: float, t
     if x.mode is State.DISARMED and _tilted(x):
         raise CommandRefused("arm is refused: the vehicle is tilted by more than 45 deg")
     if has_fallen(x):
-        raise CommandRefused("arm is refused: the vehicle has come off and lies below its perch; disarm first")
+        raise CommandRefused(f"arm is refused: {FALLEN}")
     if x.mode is State.DISARMED and specific_thrust < _ARM_FORCE_MIN:
         raise CommandRefused(f"arm is refused: the IMU measures {specific_thrust:.1f} m/s^2 along b3 at rest: its axes are configured wrongly")
 
 
 def has_fallen(x: FlightState) -> bool:
-    """Whether an attached vehicle lies below its perch. Only its height counts: the surface may carry it sideways, a wire lets it swing."""
+    """Whether an attached vehicle lies below its perch. Only its height counts: the surface may carry it sideways, a wire lets it swing.
+
+    Odometry that begins anew at a lower height looks the same, as does a fall while odometry was lost: only people can tell.
+    """
     return (x.mode is State.ATTACHED and x.setpoint().p[2] - x.state_estimate[2] > _FALLEN
             and norm(x.state_estimate[3:6]) < _FALLING)
 
