@@ -16,7 +16,8 @@ _ARM_TILT = cos(radians(45.0))  # of the largest tilt at which motors start and 
 _ARM_FORCE_MIN = 0.5 * GRAVITY  # smallest specific force along b3 there [m/s^2]
 _FALLEN = 0.5                   # at rest so far below the place of ATTACHED, nothing there carries the vehicle [m]
 _FALLING = 1.0                  # faster than this it is still falling, and the motors may save it [m/s]
-FALLEN = "the vehicle has come off and lies below its perch: disarm first; or odometry has begun anew: command ATTACHED again if the vehicle still hangs"
+FALLEN = ("the vehicle has come off and lies below its perch: disarm first; if it is still held, and the surface has carried it down or "
+          "odometry has begun anew: command ATTACHED again")
 """Reason of a refusal where `has_fallen`."""
 
 
