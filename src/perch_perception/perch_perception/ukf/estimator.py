@@ -126,7 +126,7 @@ class Estimator:
     @property
     def status(self) -> Status:
         """Health and diagnostics of the estimator."""
-        age, position, attitude = math.inf, math.inf, math.inf
+        age, position, attitude, message = math.inf, math.inf, math.inf, self._message
         health = Health.DIVERGED if self._diverged else Health.INITIALISING
         if self._live is not None:
             age = (self._imu.newest.stamp - self._applied) * 1e-9
@@ -135,8 +135,8 @@ class Estimator:
             attitude = float(np.sqrt(diagonal[at.D_ATTITUDE].max()))
             lost = position > _LOST_POSITION or attitude > _LOST_ATTITUDE
             health = Health.DIVERGED if lost else Health.COASTING if age > self.config.coasting_after else Health.RUNNING
-        return Status(health, age, self._accepted, self._rejected, self._divergences, self._nis, self._nis_dimension, position, attitude,
-                      self._message)
+            message = f"1 sigma of {position:.1f} m and {attitude:.2f} rad is too uncertain" if lost else message
+        return Status(health, age, self._accepted, self._rejected, self._divergences, self._nis, self._nis_dimension, position, attitude, message)
 
     def _compile(self) -> None:
         """Run the compiled functions once: their first compilation takes seconds, which must not happen in flight."""

@@ -24,8 +24,8 @@ class VioOutcome(enum.Enum):
     DUPLICATE = "refused: a pose of this stamp was used before"
     OUT_OF_ORDER = "refused: older than a pose, or a rest, that was used before"
     TOO_OLD = "refused: older than the IMU history"
-    FUTURE = "refused: stamp lies too far in the future"
-    NOT_FINITE = "refused: not finite"
+    FUTURE = "refused: stamp is too far ahead of the IMU, or too many poses wait for the IMU"
+    NOT_FINITE = "refused: not finite, or its quaternion is not of length 1"
     BAD_COVARIANCE = "refused: covariance is not positive semi-definite, or too large"
     NO_IMU = "refused: no IMU data yet"
 
@@ -138,7 +138,7 @@ class Status:
         broken: number of divergences: covariance not positive definite, or state not finite; each causes a restart.
         nis, nis_dimension: normalised innovation squared of the last pose that reached the gate, and its dimension.
         position_sigma, attitude_sigma: largest 1 sigma [m], [rad]; inf without an estimate.
-        message: human-readable last event.
+        message: human-readable last event; where the state is too uncertain to be used, this.
     """
 
     health: Health
