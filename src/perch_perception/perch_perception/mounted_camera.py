@@ -63,7 +63,7 @@ class MountedCamera:
             self._warn(f"{topic}: frame {frame!r} is not {self._frame!r}, that of {self._topic}: images are used, but may be of another camera", REMINDER)
 
     def take_model(self, model: CameraModel) -> bool:
-        """Take the camera's intrinsics; return whether `mount` has changed."""
+        """Take the camera's intrinsics; return whether `mount` is known and has changed."""
         camera, expected = model.camera, optical_frame(self.nominal.name)
         if self._expects_frame and model.frame not in (expected, ""):
             self._warn(f"{self._topic}: frame {model.frame!r} is not {expected!r}, whose pose in the vehicle file is used", REMINDER)
@@ -78,7 +78,7 @@ class MountedCamera:
         return self._place()
 
     def take_transform(self, transform: Transform) -> bool:
-        """Take a static transform; return whether `mount` has changed."""
+        """Take a static transform; return whether `mount` is known and has changed."""
         problem = self._transforms.add(transform)
         if problem:
             self._warn(f"/tf_static: {problem}", 1.0)

@@ -18,7 +18,7 @@ def average_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, ids
     """Return the average of the single-tag poses. [M:sec. IV-B]
 
     Args:
-        camera: the lens, for the residual.
+        camera: the lens, for the residual and its errors' effect.
         corners_S: corners of the n tags in S, shape (n, 4, 3) [m].
         rays_C: measured rays of the corners, shape (n, 4, 3).
         ids: numbers of the tags, n of them.

@@ -221,7 +221,7 @@ class BoardLocalizer:
         detection, camera = self._resolve_duplicates(detection, expected), self.mount.camera
         notes, ids = list(detection.rejected), detection.ids
         if not ids:
-            raise LocalizationRefusal("no tag of the board that is seen once")
+            raise LocalizationRefusal("every tag of the board that is found is seen several times, and no two sightings agree")
         refined = refine_corners(part.pixels, camera, detection.corners, origin=part.origin, modules=self.board.modules)
         blurred = [i for i, measured in zip(ids, refined.measured) if not measured.all()]
         if blurred:

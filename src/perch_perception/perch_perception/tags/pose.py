@@ -79,7 +79,7 @@ def solve_board(camera: Camera, corners_S: np.ndarray, rays_C: np.ndarray, sigma
         print_sigma: 1-sigma of a tag's place on the board, in each direction of its plane [m].
 
     Raises:
-        LocalizationRefusal: no pose puts the board in front of the camera, or the corners fit none.
+        LocalizationRefusal: a corner lies beyond the lens, no pose shows the front of the board, or the corners fit none.
     """
     keep, dropped = np.arange(len(ids)), list[int]()
     best = _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior_R_CS, start)
@@ -156,7 +156,7 @@ def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior
 
 
 def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the two poses of a planar target that IPPE finds, best first, as (p_CS, R_CS).
+    """Return the up to two poses of a planar target that IPPE finds, best first, as (p_CS, R_CS); none where a ray is 87 deg from their mean.
 
     Args:
         points_S: coplanar points with z_S = 0, shape (k, 3), k >= 4.

@@ -46,4 +46,4 @@ class UkfConfig:
     sensors: str = text("", doc="sensor file, config/sensors/<name>.yaml or a path: noise and axes of the IMU; empty: noise of an MPU-9250")
     imu: ImuNoise = derived(ImuNoise())
     vio: VioNoise = part(VioNoise)
-    coasting_after: float = quantity(0.15, unit="s", above=0.0, doc="age of the last accepted VIO pose")
+    coasting_after: float = quantity(0.15, unit="s", above=0.0, doc="age of the last accepted VIO pose beyond which the state is COASTING")

@@ -23,7 +23,7 @@ class FilterConfig:
 
     clones: int = quantity(11, low=4, high=30, doc="poses in the sliding window")
     landmarks: int = quantity(25, low=0, high=100, doc="points kept in the state")
-    slide_turn: float = quantity(0.9, unit="px/sqrt(rad)", low=0.0, doc="walk of a tracked point, by the angle that its bearing moves")
+    slide_turn: float = quantity(0.9, unit="px/sqrt(rad)", low=0.0, doc="walk of a tracked point, by the root of the angle that its bearing moves")
     slide_zoom: float = quantity(0.7, unit="px", low=0.0, doc="walk of a tracked point, by the root of its distance's change of logarithm")
 
 
