@@ -15,7 +15,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.config import DEFAULT_BOUNDS, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.extends import load_extended
-from perch_core.sensors import check_quaternion
+from perch_core.sensors import check_camera_names, check_quaternion
 
 GRAVITY = 9.81  # standard gravity of paper M [m/s^2]
 
@@ -163,6 +163,7 @@ class Vehicle:
     gains: ControlGains = part(ControlGains, doc="how it is flown; the controller's parameters `gains` change it in flight")
 
     def __post_init__(self) -> None:
+        check_camera_names(self.cameras)
         least, middle, most = sorted(self.inertia)
         radius = max(self.body_radii)
         for key, problem in (
