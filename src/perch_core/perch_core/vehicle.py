@@ -153,7 +153,7 @@ class Vehicle:
     drag: Vector3 = quantity((0.0, 0.0, 0.0), unit="N s/m", low=0.0, doc="linear rotor drag, axes of B")
     perch_offset: float = quantity(unit="m", low=0.0, high=1.0, doc="velcro or gripper below the centre of mass")
     stand_off: float = quantity(0.0, unit="m", low=0.0, high=0.2, doc="how far short of a wire the gripper is planned to stop")
-    rest_sag: float = quantity(0.0, unit="m", low=0.0, high=0.1, doc="how much lower it stands, felt or feet pressed by its weight")
+    ground_offset: float | None = quantity(None, unit="m", low=0.0, high=2.0, doc="centre of mass above the ground at rest; left out: perch_offset")
     perch_radius: float = quantity(0.04, unit="m", above=0.0, high=1.0, doc="radius of the velcro plate")
     body_radii: Vector3 = quantity(unit="m", above=0.0, high=5.0, doc="ellipsoid that contains the vehicle")
     propeller_radius: float = quantity(0.0, unit="m", low=0.0, high=2.0)
@@ -223,7 +223,7 @@ class Vehicle:
     @property
     def standing_height(self) -> float:
         """Height of the centre of mass above the ground while the vehicle stands on it [m]."""
-        return self.perch_offset - self.rest_sag
+        return self.perch_offset if self.ground_offset is None else self.ground_offset
 
     @cached_property
     def mounts(self) -> dict[str, CameraMount]:
