@@ -115,7 +115,7 @@ class Mavlink(Component[MavlinkParameters]):
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
-        """Store a command, which each poll sends until it is stale."""
+        """Store a command, which each poll sends until it is stale. Its age counts from its arrival: its stamp may be of another clock."""
         self._command, self._command_time, self._held_polls = command, self._now or 0, 0
         self.offboard.arming.command((self._now or 0) * 1e-9, command.armed)
 
