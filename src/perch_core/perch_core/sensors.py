@@ -132,9 +132,6 @@ class Sensors:
     cameras: dict[str, CameraSensor] = part(dict)
     imu: ImuSensor | None = text(None)
 
-    def __post_init__(self) -> None:
-        check_camera_names(self.cameras)
-
     @cached_property
     def mounts(self) -> dict[str, CameraMount]:
         """The cameras with their poses on the body, by name."""
@@ -147,14 +144,17 @@ def load_sensors(name_or_path: str | Path) -> Sensors:
     Raises:
         ConfigError: no such file, or a value that is refused.
     """
-    return config.load(Sensors, config.find("sensors", name_or_path))
+    file = config.find("sensors", name_or_path)
+    sensors = config.load(Sensors, file)
+    check_camera_names(sensors.cameras, str(file))
+    return sensors
 
 
 def _rotation(q: Quaternion) -> np.ndarray:
     return so3.quat_to_matrix(np.array(q) / np.linalg.norm(q))
 
 
-def check_camera_names(names: Iterable[str]) -> None:
+def check_camera_names(names: Iterable[str], source: str = "") -> None:
     """Refuse names of cameras of which no topic `camera_<name>/...` can be made.
 
     Raises:
@@ -162,7 +162,7 @@ def check_camera_names(names: Iterable[str]) -> None:
     """
     for name in names:
         if not re.fullmatch(r"[A-Za-z0-9_]+", name):
-            raise ConfigError("", "cameras", f"{name!r} is no name of a camera: its topics are camera_<name>/..., of letters, digits and underscores")
+            raise ConfigError(source, "cameras", f"{name!r} is no name of a camera: its topics are camera_<name>/..., of letters, digits and underscores")
 
 
 def check_quaternion(key: str, q: Quaternion) -> None:
