@@ -364,6 +364,10 @@ def test_it_arms_by_its_own_way_and_says_why_not(autopilot):
     autopilot.say(m.statustext_encode(2, b"Preflight Fail: Accel #0 uncalibrated"))
     autopilot.heard()
     said = " | ".join(line.text for line in autopilot.got["log"])
+    lines = len(autopilot.got["log"])
+    autopilot.say(m.command_ack_encode(400, 2, target_system=255, target_component=190))
+    autopilot.heard()
+    assert len(autopilot.got["log"]) == lines, "the answer is to a ground station"
     assert "refuses arming: TEMPORARILY_REJECTED" in said and "Preflight Fail: Accel #0 uncalibrated" in said
 
 
@@ -385,6 +389,28 @@ def test_set_points_stop_where_a_controller_is_started_again_in_flight(autopilot
     assert sent(False) == set() and "was the controller started again?" in autopilot.got["log"][-1].text
     assert sent(True) == {"SET_ATTITUDE_TARGET"}
     assert sent(False) == {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}
+
+
+def test_a_pilot_who_hands_over_to_a_disarmed_controller_in_flight_keeps_the_motors(autopilot):
+    """He has taken the mode of set points back, and the controller was disarmed meanwhile."""
+    m = autopilot.mavlink
+
+    def sent(armed: bool, mode: int) -> set:
+        autopilot.heard()
+        kinds = set()
+        for k in range(240):
+            if k % 60 == 0:
+                autopilot.say(m.heartbeat_encode(2, PX4, ARMED, mode, 4))
+            autopilot.node.on_rates_thrust(RatesThrust(0, armed, (0.0, 0.0, 0.0), 9.81 if armed else 0.0))
+            kinds |= set(autopilot.heard())
+        return kinds & {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}
+
+    assert sent(True, OFFBOARD) == {"SET_ATTITUDE_TARGET"}
+    assert sent(True, 0) == {"SET_ATTITUDE_TARGET"}, "without set points PX4 does not let him hand over"
+    assert sent(False, 0) == set() and not any("motors off" in line.text for line in autopilot.got["log"])
+    assert sent(False, OFFBOARD) == set() and "until the autopilot is disarmed by its pilot" in autopilot.got["log"][-1].text
+    assert sent(True, OFFBOARD) == {"SET_ATTITUDE_TARGET"}
+    assert sent(False, OFFBOARD) == {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}
 
 
 def test_it_disarms_in_flight_what_it_has_flown(autopilot):
@@ -462,6 +488,18 @@ def test_kill_is_not_repeated_for_long_nor_by_a_clock_that_jumps():
         if jump:
             machine.set_time(10.0 + jump)
         assert asked(machine, 20.0, start=10.0 + jump) == [Request.DISARM] * count
+
+
+def test_a_heartbeat_of_before_kill_does_not_end_it():
+    """It was sent before the autopilot had received the request to arm; KILL's own frame is lost."""
+    machine = Offboard(autopilot=PX4, following=True)
+    machine.arming.command(0.9, True)
+    machine.kill(1.0)
+    machine.heartbeat(1.1, PX4, 0, OFFBOARD)
+    machine.heartbeat(2.1, PX4, ARMED, OFFBOARD)
+    assert machine.next_request(2.1, True, True) is Request.DISARM
+    machine.heartbeat(3.1, PX4, 0, OFFBOARD)
+    assert machine.next_request(3.2, True, True) is Request.NOTHING
 
 
 def test_after_kill_commands_with_the_motors_off_disarm_however_late_the_link_is_back():

@@ -149,3 +149,9 @@ def test_a_message_is_measured_before_it_is_read():
 
 def test_the_page_is_what_the_declarations_say():
     assert (ROOT / "docs" / "limits.md").read_text() == page(), "python3 scripts/limits.py writes it"
+
+
+@pytest.mark.parametrize("channel", ["rates_thrust_command", "controller/command"])
+def test_the_page_names_the_nodes_of_autopilots(channel):
+    line = next(line for line in page().splitlines() if line.startswith(f"| `{channel}`"))
+    assert "betaflight" in line and "mavlink" in line

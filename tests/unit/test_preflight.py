@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from perch_core.camera import PinholeCamera
 from perch_core.component import Diagnostics
-from perch_core.errors import PerchError
+from perch_core.errors import ConfigError, PerchError
 from perch_core.ros.topics import topic
+from perch_core.sensors import CameraSensor, Sensors, load_sensors
 from perch_core.urdf import fixed_frames
 from perch_core.values import CameraModel, ControllerCommand, ControllerStatus, ImuSample, MotorCommand, RotorState
 from perch_core.vehicle import load_vehicle
@@ -101,6 +102,61 @@ def test_cameras_and_extrinsics_are_compared_with_the_file():
     moved = [f._replace(p=(f.p[0] + 0.05, *f.p[1:])) if f.child.startswith("camera_front") else f for f in frames]
     failed = [check.name for check in checks.check_extrinsics(moved, VEHICLE) if check.verdict is FAILED]
     assert failed == ["extrinsics camera_front_optical_frame"]
+
+
+def described(**cameras):
+    return Sensors(name="mine", cameras=cameras)
+
+
+RADTAN = CameraSensor(model="radtan", width=640, height=480, focal=(400.0, 400.0), centre=(320.0, 240.0), distortion=(-0.28, 0.07, 0.0002, 0.0),
+                      position=(0.1, 0.0, 0.0), orientation=(-0.5, 0.5, -0.5, 0.5))
+EQUIDISTANT = replace(RADTAN, model="equidistant", distortion=(0.0039, -0.0096, 0.0102, -0.0033))
+
+
+@pytest.mark.parametrize("sensor", [RADTAN, EQUIDISTANT])
+def test_cameras_of_a_sensor_file_are_those_that_are_compared(sensor, monkeypatch):
+    monkeypatch.setattr(command, "load_sensors", lambda name: described(down=sensor, cam0=RADTAN))
+    monkeypatch.setattr(command, "imu_in_body", lambda *_: still())
+    mounts = described(down=sensor, cam0=RADTAN).mounts
+    model = CameraModel(0, "of its driver", sensor.camera)
+    graph = SimpleNamespace(values={"imu/data_raw": [], "odometry": [], "/tf_static": [(0.0, f) for f in fixed_frames(VEHICLE, mounts)],
+                                    "camera_down/camera_info": [(0.0, model)], "camera_cam0/camera_info": []})
+    graph.newest = lambda channel: graph.values[channel][-1][1] if graph.values[channel] else None
+    graph.arrivals_and_stamps = lambda channel: []
+    seen = verdicts(command.passive_checks(graph, VEHICLE, "mine"))
+    assert seen["camera_down model"] is seen["extrinsics camera_down_optical_frame"] is seen["extrinsics camera_cam0_optical_frame"] is PASSED
+    assert seen["camera_cam0 model"] is FAILED and not any("front" in name for name in seen)
+    rates = np.random.default_rng(6).standard_normal((60, 3))
+    assert checks.check_rotation("cam0", rates, rates @ mounts["cam0"].R_BC, described(cam0=RADTAN)).verdict is PASSED
+    monkeypatch.setattr(command, "load_sensors", lambda name: Sensors(name="mine"))
+    assert command.described_cameras(VEHICLE, "mine") is VEHICLE, "as the nodes: its cameras count where the file has none"
+
+
+@pytest.mark.parametrize("sent, words", [
+    ({"distortion": (-0.1, 0.07, 0.0002, 0.0)}, "lens differ: mine has 640 x 480 px, plumb_bob"), ({"distortion": ()}, "lens differ"),
+    ({"model": "equidistant"}, "lens differ"), ({"width": 320}, "image size differ"), ({"width": 320, "focal": (200.0, 200.0)}, "image size and lens")])
+def test_what_differs_from_the_sensor_file_is_named(sent, words):
+    model = CameraModel(0, "of its driver", replace(RADTAN, **sent).camera)
+    check = checks.check_camera_model("cam0", model, described(cam0=RADTAN))
+    assert check.verdict is FAILED and words in check.advice and "distortion [-0.28, 0.07, 0.0002, 0.0" in check.advice
+
+
+@pytest.mark.parametrize("name", ["left eye", "a.b", "stereo-left"])
+def test_a_camera_whose_name_makes_no_topic_is_refused_with_its_file(name, tmp_path):
+    sensors, vehicle = tmp_path / "eyes.yaml", tmp_path / "quad.yaml"
+    sensors.write_text(f"name: eyes\ncameras:\n  {name}: {{model: pinhole, width: 64, height: 48, focal: [60, 60], centre: [32, 24]}}\n")
+    vehicle.write_text(f"extends: snapdragon\ncameras:\n  {name}: {{model: pinhole, width: 64, height: 48, focal: [60, 60], centre: [32, 24], "
+                       "position: [0, 0, 0], orientation: [0, 0, 0, 1]}\n")
+    for load, file in ((load_sensors, sensors), (load_vehicle, vehicle)):
+        with pytest.raises(ConfigError, match=f"{file.name}.*: cameras: '{name}' is no name of a camera"):
+            load(file)
+
+
+def test_the_graph_is_asked_for_the_cameras_that_are_described(monkeypatch):
+    with reserved_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        with closing(listener.GraphListener(VEHICLE, cameras=("cam0", "1"))) as graph:
+            assert {name for name in graph.values if name.startswith("camera")} == {"camera_cam0/camera_info", "camera_1/camera_info"}
 
 
 @pytest.mark.parametrize("felt, words", [

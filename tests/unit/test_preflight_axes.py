@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -89,10 +90,10 @@ def refused(seen: Seen, monkeypatch, capsys, axes: np.ndarray = np.eye(3), file:
     class Bench(listener.GraphListener):
         """In the place of the graph: everything is there at once."""
 
-        def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
+        def __init__(self, vehicle: Vehicle, namespace: str = "", cameras: Iterable[str] = ()) -> None:
             values = {**seen.rest, "imu/data_raw": read(seen.rest["imu/data_raw"])}
             self.values = {channel: [(1e-9 * getattr(value, "stamp", 0), value) for value in values.get(channel, [])]
-                           for channel in listener.CHANNELS}
+                           for channel in (*listener.CHANNELS, *(f"camera_{name}/camera_info" for name in cameras))}
             self.turns = CameraTurns(MOUNT.camera)
 
         def subscribe_camera(self, camera, model) -> None:

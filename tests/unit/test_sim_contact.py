@@ -215,6 +215,8 @@ def test_a_vehicle_does_not_start_within_the_panel(height, panel, refused):
     (2.35, VEHICLE, ""),
     (0.0, dataclasses.replace(VEHICLE, mass=5.0, inertia=(0.02, 0.02, 0.04), speed_max=9e3, perch_offset=0.02),
      "perch_offset: 0.02 m: the vehicle would stand on its rotors, as its weight presses the plate's felt by 0.025 m"),
+    (0.0, dataclasses.replace(VEHICLE, ground_offset=0.12), "ground_offset: 0.12 m: the simulated vehicle stands on its plate, at 0.039 m"),
+    (0.0, dataclasses.replace(VEHICLE, ground_offset=0.04), ""),
 ])
 def test_a_vehicle_does_not_start_within_a_wall_nor_on_its_rotors(y, vehicle, words):
     scenario = dataclasses.replace(SCENARIO, start=Start(position=(0.0, y, 0.0)))

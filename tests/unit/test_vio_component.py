@@ -14,6 +14,7 @@ from perch_core.values import CameraImage, CameraModel, ImuSample, InertialState
 from perch_core.vehicle import load_vehicle
 from open_loop.flight import motion_of
 from open_loop.motion import read_imu
+from perch_perception import vio_component
 from perch_perception.estimator_component import StateEstimator
 from perch_perception.ukf import UkfConfig
 from perch_perception.vio_component import VioComponent, VioComponentConfig
@@ -138,6 +139,14 @@ def test_images_wait_for_camera_info_and_the_imu():
         if sample.stamp >= stamp + 8_000_000:
             flight.component.on_imu(sample)
     assert len(flight.out["diagnostics"]) == 1
+
+
+def test_a_vehicle_on_legs_starts_as_high_as_its_file_says(tmp_path, monkeypatch):
+    legs, given = tmp_path / "legs.yaml", []
+    legs.write_text("extends: snapdragon\nground_offset: 0.12\n")
+    monkeypatch.setattr(vio_component, "VisualInertialOdometry", lambda config, mount, standing, yaw, floor: given.extend((*standing, floor)))
+    VioComponent(VioComponentConfig(vehicle=str(legs), start_position=(1.0, 2.0, 0.5)))
+    assert given == pytest.approx([1.0, 2.0, 0.62, 0.5])
 
 
 def test_a_missing_imu_is_named():

@@ -112,7 +112,10 @@ class Betaflight(Component[BetaflightParameters]):
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
-        """Send a command to the autopilot; it is in effect until the next one, or until it is stale."""
+        """Send a command to the autopilot; it is in effect until the next one, or until it is stale.
+
+        Its age counts from its arrival: its stamp is that of a sample, by the clock of any sensor.
+        """
         if not self._arming.command(seconds(self._now or 0), command.armed):
             self._link.kill()
             return

@@ -36,6 +36,7 @@ _HELD_POLLS = round(_HELD / (_POLL * NANOSECONDS))  # ... or after so many polls
 _RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")  # MAV_RESULT
 _SET_MODE, _ARM_DISARM, _SET_INTERVAL = 176, 400, 511  # MAV_CMD_DO_SET_MODE, MAV_CMD_COMPONENT_ARM_DISARM, MAV_CMD_SET_MESSAGE_INTERVAL
 _HIGHRES_IMU, _IMU_RATE = 105, 200   # its message id; rate that is requested: autopilots send it at 50 Hz or not at all by default [Hz]
+_COMPONENT = 191                     # ours: MAV_COMP_ID_ONBOARD_COMPUTER
 _FORCED = 21196.0                    # of MAV_CMD_COMPONENT_ARM_DISARM: disarm also in flight
 _LOCAL_FRD, _BODY_FRD = 20, 12       # MAV_FRAME: axes as NED, whose x need not be north; ArduPilot takes no other odometry
 _ODOMETRY_PERIOD = NANOSECONDS // 50  # odometry is sent no more often: at 500 Hz it alone, 240 bytes each, would fill 921600 baud [ns]
@@ -84,7 +85,7 @@ class Mavlink(Component[MavlinkParameters]):
         self._thrust_max = 4.0 * vehicle.thrust_max / vehicle.mass
         link = Link(config.link)
         self._link: Link | None = link       # None: it has ended
-        self._mavlink = common.MAVLink(None, srcSystem=config.system, srcComponent=191)  # MAV_COMP_ID_ONBOARD_COMPUTER
+        self._mavlink = common.MAVLink(None, srcSystem=config.system, srcComponent=_COMPONENT)
         self._mavlink.robust_parsing = True
         self.offboard, self._clock = Offboard(), ClockOffset()
         self._command: RatesThrust | None = None
@@ -114,7 +115,7 @@ class Mavlink(Component[MavlinkParameters]):
     # -- to the autopilot --------------------------------------------------------------------------------------------
 
     def on_rates_thrust(self, command: RatesThrust) -> None:
-        """Store a command, which each poll sends until it is stale."""
+        """Store a command, which each poll sends until it is stale. Its age counts from its arrival: its stamp may be of another clock."""
         self._command, self._command_time, self._held_polls = command, self._now or 0, 0
         self.offboard.arming.command((self._now or 0) * 1e-9, command.armed)
 
@@ -177,9 +178,10 @@ class Mavlink(Component[MavlinkParameters]):
             command = None
         if command is not None and not self.offboard.obeys(command.armed):
             stop = self.offboard.arming.stop
-            self.log(LogLine("error", f"{stop.value}: commands with the motors on are not obeyed until they have them off" if stop and command.armed
-                             else "commands have the motors off, but a flight may have begun before them (was the controller started "
-                             "again?): not obeyed until the autopilot is disarmed by its pilot or its failsafe", 2.0))
+            if command.armed or self.offboard.following:
+                self.log(LogLine("error", f"{stop.value}: commands with the motors on are not obeyed until they have them off" if stop and command.armed
+                                 else "commands have the motors off, but a flight may have begun before them (was the controller started "
+                                 "again?): not obeyed until the autopilot is disarmed by its pilot or its failsafe", 2.0))
             command = None
         if command is not None:
             self._send_set_point(command)
@@ -255,7 +257,7 @@ class Mavlink(Component[MavlinkParameters]):
                 self._send(self._mavlink.timesync_encode(now, message.ts1))
             else:
                 self._clock.answered(message.ts1, message.tc1, now)
-        elif kind == "COMMAND_ACK" and message.result not in (0, 5):
+        elif kind == "COMMAND_ACK" and message.result not in (0, 5) and message.target_component in (0, _COMPONENT):
             what = {_SET_MODE: "the mode", _ARM_DISARM: "disarming" if self.offboard.armed else "arming",
                     _SET_INTERVAL: f"to send HIGHRES_IMU at {_IMU_RATE} Hz"}.get(message.command)
             if what is not None:

@@ -69,7 +69,7 @@ class Offboard:
         self._last_heartbeat, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
         self.following = custom_mode == self.mode
         self.arming.report(now, self.armed)
-        if not self.armed:
+        if not self.armed and now - (self._disarm_until - KILL_TIME) >= LATENCY:  # else it may be of before KILL
             self._disarm_until = -1e9
 
     def set_time(self, now: float) -> None:
@@ -92,8 +92,12 @@ class Offboard:
         return 0.0 <= now - self._last_heartbeat < HEARTBEAT_TIMEOUT
 
     def obeys(self, armed: bool) -> bool:
-        """Return whether the autopilot may be sent a command with the motors on (`armed`) or off."""
-        return self.arming.stop is None if armed else self.commanding or not self.armed
+        """Return whether the autopilot may be sent a command with the motors on (`armed`) or off.
+
+        Set points without thrust would let a pilot who flies in another mode select theirs. After a lost link the mode is not known.
+        """
+        elsewhere = not self.following and self._last_heartbeat > -1e9
+        return self.arming.stop is None if armed else not self.armed or self.commanding and not elsewhere
 
     def next_request(self, now: float, wanted: bool, streaming: bool) -> Request:
         """Return the request to send at a time, at most one each `REQUEST_PERIOD` seconds.

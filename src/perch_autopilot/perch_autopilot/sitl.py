@@ -20,7 +20,7 @@ from pathlib import Path
 from perch_core.arrays import Numbers
 from perch_core.files import replacement
 from perch_autopilot import firmware, msp
-from perch_autopilot.configuration import Cli, CliError, Configuration
+from perch_autopilot.configuration import Cli, Configuration
 from perch_autopilot.firmware import FirmwareError
 from perch_autopilot.namespace import IsolatedProgram
 
@@ -203,6 +203,3 @@ def remove_orphans() -> None:
         with suppress(OSError):  # another process has removed it
             if time.time() - folder.stat().st_mtime > _ORPHAN:
                 shutil.rmtree(folder, ignore_errors=True)
-
-
-__all__ = ["CliError", "FirmwareTimeoutError", "Sitl"]

@@ -6,6 +6,8 @@ for recordings; `scripts/sensors.py import` converts a Kalibr or EuRoC calibrati
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -142,11 +144,25 @@ def load_sensors(name_or_path: str | Path) -> Sensors:
     Raises:
         ConfigError: no such file, or a value that is refused.
     """
-    return config.load(Sensors, config.find("sensors", name_or_path))
+    file = config.find("sensors", name_or_path)
+    sensors = config.load(Sensors, file)
+    check_camera_names(sensors.cameras, str(file))
+    return sensors
 
 
 def _rotation(q: Quaternion) -> np.ndarray:
     return so3.quat_to_matrix(np.array(q) / np.linalg.norm(q))
+
+
+def check_camera_names(names: Iterable[str], source: str = "") -> None:
+    """Refuse names of cameras of which no topic `camera_<name>/...` can be made.
+
+    Raises:
+        ConfigError: a name has other characters than letters, digits and underscores.
+    """
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z0-9_]+", name):
+            raise ConfigError(source, "cameras", f"{name!r} is no name of a camera: its topics are camera_<name>/..., of letters, digits and underscores")
 
 
 def check_quaternion(key: str, q: Quaternion) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import atan2, hypot
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -11,6 +11,7 @@ import numpy as np
 
 from perch_core import so3
 from perch_core.arrays import quaternion, vector3
+from perch_core.camera_mount import CameraMount
 from perch_core.static_transforms import BASE
 from perch_core.vehicle import Vehicle
 from perch_core.values import Transform
@@ -27,11 +28,14 @@ def optical_frame(camera: str) -> str:
     return f"camera_{camera}_optical_frame"
 
 
-def fixed_frames(vehicle: Vehicle) -> tuple[Transform, ...]:
-    """Return the frames that are fixed to the body: IMU and cameras in `base_link`, whose origin is the centre of mass."""
+def fixed_frames(vehicle: Vehicle, mounts: Mapping[str, CameraMount] | None = None) -> tuple[Transform, ...]:
+    """Return the frames that are fixed to the body: IMU and cameras in `base_link`, whose origin is the centre of mass.
+
+    `mounts`: cameras in place of the vehicle's.
+    """
     imu = Transform(BASE, IMU, vehicle.imu.position, (0.0, 0.0, 0.0, 1.0))
     cameras = (Transform(BASE, optical_frame(name), vector3(mount.p_BC), quaternion(so3.quat_from_matrix(mount.R_BC)))
-               for name, mount in vehicle.mounts.items())
+               for name, mount in (vehicle.mounts if mounts is None else mounts).items())
     return imu, *cameras
 
 

@@ -15,7 +15,7 @@ from perch_core.camera_mount import CameraMount
 from perch_core.config import DEFAULT_BOUNDS, choice, label, part, quantity, text
 from perch_core.errors import ConfigError
 from perch_core.extends import load_extended
-from perch_core.sensors import check_quaternion
+from perch_core.sensors import check_camera_names, check_quaternion
 
 GRAVITY = 9.81  # standard gravity of paper M [m/s^2]
 
@@ -153,7 +153,7 @@ class Vehicle:
     drag: Vector3 = quantity((0.0, 0.0, 0.0), unit="N s/m", low=0.0, doc="linear rotor drag, axes of B")
     perch_offset: float = quantity(unit="m", low=0.0, high=1.0, doc="velcro or gripper below the centre of mass")
     stand_off: float = quantity(0.0, unit="m", low=0.0, high=0.2, doc="how far short of a wire the gripper is planned to stop")
-    rest_sag: float = quantity(0.0, unit="m", low=0.0, high=0.1, doc="how much lower it stands, felt or feet pressed by its weight")
+    ground_offset: float | None = quantity(None, unit="m", low=0.0, high=2.0, doc="centre of mass above the ground at rest; left out: perch_offset")
     perch_radius: float = quantity(0.04, unit="m", above=0.0, high=1.0, doc="radius of the velcro plate")
     body_radii: Vector3 = quantity(unit="m", above=0.0, high=5.0, doc="ellipsoid that contains the vehicle")
     propeller_radius: float = quantity(0.0, unit="m", low=0.0, high=2.0)
@@ -163,6 +163,7 @@ class Vehicle:
     gains: ControlGains = part(ControlGains, doc="how it is flown; the controller's parameters `gains` change it in flight")
 
     def __post_init__(self) -> None:
+        check_camera_names(self.cameras)
         least, middle, most = sorted(self.inertia)
         radius = max(self.body_radii)
         for key, problem in (
@@ -222,7 +223,7 @@ class Vehicle:
     @property
     def standing_height(self) -> float:
         """Height of the centre of mass above the ground while the vehicle stands on it [m]."""
-        return self.perch_offset - self.rest_sag
+        return self.perch_offset if self.ground_offset is None else self.ground_offset
 
     @cached_property
     def mounts(self) -> dict[str, CameraMount]:

@@ -58,8 +58,8 @@ class Plant:
             start: time of the initial state [ns].
 
         Raises:
-            ConfigError: the board does not exist, the vehicle would stand in the panel, in a wall or on its rotors, a disturbance does
-                not suit it, or the plate is so far from the centre of mass that steps of 0.5 ms cannot follow its hold.
+            ConfigError: the board does not exist, the vehicle would stand in the panel, in a wall, on its rotors or on legs, a disturbance
+                does not suit it, or the plate is so far from the centre of mass that steps of 0.5 ms cannot follow its hold.
         """
         self.body = make_body(vehicle, scenario.disturbance)
         if hold_rate(self.body) * STEP > STABLE:
@@ -72,6 +72,10 @@ class Plant:
         self.rotor_speed = np.zeros(4)
         self._start = start
         self._x = resting_state(scenario, self.body)
+        height = float(self._x[2]) - scenario.start.position[2]
+        if vehicle.ground_offset is not None and abs(vehicle.ground_offset - height) > START_DEPTH:
+            raise ConfigError(vehicle_file(scenario.vehicle), "ground_offset", f"{vehicle.ground_offset:g} m: the simulated vehicle stands on its "
+                              f"plate, at {height:.3f} m")
         self._wind = WindField(scenario.wind, CONTROL_PERIOD, seeding.stream(seed, "wind"))
         self._touched = np.zeros((len(self.obstacles.names), 3))
         self._warm_up()

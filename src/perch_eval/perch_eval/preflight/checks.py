@@ -12,6 +12,8 @@ import numpy as np
 from perch_control.modes import State
 from perch_core import so3
 from perch_core.camera import Camera
+from perch_core.camera_mount import CameraMount
+from perch_core.sensors import Sensors
 from perch_core.urdf import fixed_frames, optical_frame
 from perch_core.values import CameraModel, ControllerStatus, ImuSample, OdometryState, Transform, seconds
 from perch_core.vehicle import GRAVITY, Vehicle
@@ -31,9 +33,9 @@ MIN_ROTATION_RATE = 0.3  # root mean square of the rates about each axis that sh
 RESPONSE_TIME = 2.0      # from a command to its effect, observed by a program that shares the machine with others [s]
 STOP_TIME = 1.0          # from the last command to the motors' stop [s] ...
 DESCENT_TIME = 5.0       # ... and where an autopilot levels and descends first [s]
-RATES = {"imu/data_raw": (100.0, 1000.0), "odometry": (50.0, 1000.0), "camera_down/camera_info": (10.0, 120.0),
-         "camera_front/camera_info": (5.0, 120.0)}
+RATES = {"imu/data_raw": (100.0, 1000.0), "odometry": (50.0, 1000.0), "camera_down/camera_info": (10.0, 120.0)}
 """Channel -> (lowest, highest) rate of its stamps [Hz], with a tolerance of 10 %."""
+CAMERA_RATES = (5.0, 120.0)  # of every other camera [Hz]
 _STATES = {state.value: state.name.lower() for state in State}
 
 
@@ -66,7 +68,7 @@ def make_check(name: str, good: bool, observation: str, advice: str) -> Check:
 
 def check_stream(channel: str, stamps: Sequence[int]) -> list[Check]:
     """Check the rate of a channel, and whether its stamps [ns] grow evenly."""
-    low, high = RATES[channel]
+    low, high = RATES.get(channel, CAMERA_RATES)
     if len(stamps) < 3:
         return [Check(f"rate {channel}", Verdict.FAILED, f"{len(stamps)} messages",
                       "start its publisher; check namespaces, ROS_DOMAIN_ID and QoS (topic.py info)")]
@@ -115,36 +117,38 @@ def check_clocks(imu: Sequence[tuple[float, int]], frames: Mapping[str, Sequence
     return found
 
 
-def check_camera_model(name: str, model: CameraModel | None, vehicle: Vehicle) -> Check:
-    """Check a camera's intrinsics and frame against the vehicle file."""
-    mount, title = vehicle.mounts[name], f"camera_{name} model"
+def check_camera_model(name: str, model: CameraModel | None, cameras: Vehicle | Sensors) -> Check:
+    """Check a camera's intrinsics against the vehicle or sensor file; its frame, too, which a sensor file leaves open."""
+    title = f"camera_{name} model"
     if model is None:
         return Check(title, Verdict.FAILED, "no camera_info", f"see rate camera_{name}/camera_info")
-    received, expected = model.camera, mount.camera
+    received, expected = model.camera, cameras.mounts[name].camera
+    frame = model.frame if isinstance(cameras, Sensors) else optical_frame(name)
     u, v = np.meshgrid(np.linspace(0.0, expected.width - 1.0, 5), np.linspace(0.0, expected.height - 1.0, 5))
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
     rays = expected.unproject(pixels)
     known = np.isfinite(rays).all(axis=1)  # others lie beyond a fisheye's circle
     apart = np.linalg.norm(received.project(rays[known])[0] - pixels[known], axis=1)
     off = float(np.nan_to_num(apart, nan=np.inf).max())
-    good = (received.width, received.height) == (expected.width, expected.height) and off < MAX_PIXEL_ERROR and model.frame == optical_frame(name)
-    return make_check(title, good, f"{_camera(received)}, frame {model.frame}: points lie up to {off:.1f} px from where the file has them",
-                      f"the file has {_camera(expected)}, frame {optical_frame(name)}: calibrate, or use the right file")
+    wrong = [what for what, good in (("image size", (received.width, received.height) == (expected.width, expected.height)),
+                                     ("lens", off < MAX_PIXEL_ERROR), ("frame", model.frame == frame)) if not good]
+    return make_check(title, not wrong, f"{_camera(received)}, frame {model.frame}: points lie up to {off:.1f} px from where the file has them",
+                      f"{' and '.join(wrong)} differ: {cameras.name} has {_camera(expected)}, frame {frame}: calibrate, or use the right file")
 
 
 def _camera(camera: Camera) -> str:
     return (f"{camera.width} x {camera.height} px, {camera.model}, f {camera.fx:.1f}, {camera.fy:.1f} px, "
-            f"centre {camera.cx:.1f}, {camera.cy:.1f} px")
+            f"centre {camera.cx:.1f}, {camera.cy:.1f} px, distortion {np.round(camera.distortion, 4).tolist()}")
 
 
-def check_extrinsics(transforms: Sequence[Transform], vehicle: Vehicle) -> list[Check]:
-    """Check the fixed transforms of the graph against the vehicle file."""
+def check_extrinsics(transforms: Sequence[Transform], vehicle: Vehicle, mounts: Mapping[str, CameraMount] | None = None) -> list[Check]:
+    """Check the fixed transforms of the graph against the vehicle file, or those of the cameras against `mounts`."""
     found = []
-    for expected in fixed_frames(vehicle):
+    for expected in fixed_frames(vehicle, mounts):
         received = next((t for t in transforms if t.child == expected.child), None)
         if received is None:
             found.append(Check(f"extrinsics {expected.child}", Verdict.OPEN, "not published",
-                               "acceptable where the nodes take it from the vehicle file; else start `description`"))
+                               "acceptable where the nodes take it from their file; else start `description`"))
             continue
         apart = float(np.linalg.norm(np.subtract(received.p, expected.p)))
         turn = degrees(float(np.linalg.norm(attitude_error(np.array(expected.q), np.array(received.q)))))
@@ -179,7 +183,7 @@ def camera_rotation(turned_B: np.ndarray, turned_C: np.ndarray) -> tuple[np.ndar
     return U @ Vt, float(np.linalg.svd(turned_B, compute_uv=False)[2] / np.sqrt(max(len(turned_B), 1)))
 
 
-def check_rotation(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicle: Vehicle) -> Check:
+def check_rotation(name: str, turned_B: np.ndarray, turned_C: np.ndarray, cameras: Vehicle | Sensors) -> Check:
     """Check the rotation between a camera and the IMU, and the gyroscope's scale, while the vehicle is rotated by hand.
 
     `turned_B` and `turned_C` are those of `camera_rotation`.
@@ -205,9 +209,9 @@ def check_rotation(name: str, turned_B: np.ndarray, turned_C: np.ndarray, vehicl
     if residual > MAX_RESIDUAL:
         return Check(title, Verdict.FAILED, f"{100 * residual:.0f} % of the gyroscope's rates are not the camera's",
                      "an axis of the gyroscope has another scale, the clocks differ, or the scene moves: check these, and repeat")
-    off = degrees(float(np.linalg.norm(so3.log(vehicle.mounts[name].R_BC.T @ R))))
+    off = degrees(float(np.linalg.norm(so3.log(cameras.mounts[name].R_BC.T @ R))))
     return make_check(title, off < MAX_ROTATION_ERROR, f"{off:.1f} deg from the file",
-                      f"R_BC is about {np.round(R, 2).tolist()}: correct `orientation` in the vehicle file, or the IMU's axes")
+                      f"R_BC is about {np.round(R, 2).tolist()}: correct `orientation` in the file, or the IMU's axes")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy as np
 from perch_control.modes import State
 from perch_core.errors import PerchError
 from perch_core.imu_axes import ImuAxes
+from perch_core.sensors import Sensors, load_sensors
 from perch_core.values import Command, ImuSample
 from perch_core.vehicle import Vehicle, load_vehicle
 from perch_eval.arguments import command, command_parser
@@ -33,11 +34,11 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     out = command_parser("preflight.py", "Check a running vehicle before it flies.", EXAMPLES)
     out.add_argument("--vehicle", required=True, help="vehicle file, or its name in config/vehicles")
-    out.add_argument("--sensors", default="", help="sensor file that its nodes are given: axes of the IMU")
+    out.add_argument("--sensors", default="", help="sensor file that its nodes are given: axes of the IMU, and its cameras in place of the vehicle's")
     out.add_argument("--namespace", default="", help="namespace of its nodes")
     out.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
-    out.add_argument("--shake", choices=("down", "front"),
-                     help="camera whose rotation to the IMU is checked; rotate the vehicle by hand for 10 s when asked")
+    out.add_argument("--shake", metavar="CAMERA",
+                     help="camera, as down, whose rotation to the IMU is checked; rotate the vehicle by hand for 10 s when asked")
     out.add_argument("--props-off", action="store_true", help="no propellers are mounted: the motors may be started")
     out.add_argument("--takeover", action="store_true", help="with --props-off: the pilot will take over, with the pilot's arming switch off")
     out.add_argument("--watchdog", action="store_true", help="with --props-off: the controller will be stopped by hand")
@@ -52,31 +53,38 @@ def imu_in_body(listener: Any, sensors: str) -> list[ImuSample]:
     return [taken for _, sample in listener.values["imu/data_raw"] if (taken := axes.in_body(sample)) is not None]
 
 
+def described_cameras(vehicle: Vehicle, sensors: str) -> Vehicle | Sensors:
+    """Return what describes the cameras for the nodes: the sensor file if it has any, else the vehicle."""
+    described = load_sensors(sensors) if sensors else None
+    return described if described and described.cameras else vehicle
+
+
 def passive_checks(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]:
     """Return the checks of a vehicle at rest."""
+    cameras = described_cameras(vehicle, sensors)
     values = {channel: [value for _, value in entries] for channel, entries in listener.values.items()}
-    channels = [c for c in checks.RATES if not c.startswith("camera_") or c.split("/")[0].removeprefix("camera_") in vehicle.mounts]
+    channels = ("imu/data_raw", "odometry", *(f"camera_{name}/camera_info" for name in cameras.mounts))
     found = [check for channel in channels for check in checks.check_stream(channel, [value.stamp for value in values[channel]])]
-    frames = {name: listener.arrivals_and_stamps(f"camera_{name}/camera_info") for name in vehicle.mounts}
+    frames = {name: listener.arrivals_and_stamps(f"camera_{name}/camera_info") for name in cameras.mounts}
     found += checks.check_clocks(listener.arrivals_and_stamps("imu/data_raw"), frames)
     imu = imu_in_body(listener, sensors)
     found += checks.check_frames(listener.newest("odometry"), listener.newest("imu/data_raw"), bool(imu))
     found += checks.check_at_rest(imu)
-    found += [checks.check_camera_model(name, listener.newest(f"camera_{name}/camera_info"), vehicle) for name in vehicle.mounts]
-    return found + checks.check_extrinsics(values["/tf_static"], vehicle)
+    found += [checks.check_camera_model(name, listener.newest(f"camera_{name}/camera_info"), cameras) for name in cameras.mounts]
+    return found + checks.check_extrinsics(values["/tf_static"], vehicle, cameras.mounts)
 
 
 def rotation_check(listener: Any, vehicle: Vehicle, camera: str | None, sensors: str) -> Check:
     """Ask for the vehicle to be rotated and check the rotation between camera and IMU; without a camera it is not exercised."""
-    turned = np.zeros((0, 3)), np.zeros((0, 3))
+    turned, cameras = (np.zeros((0, 3)), np.zeros((0, 3))), described_cameras(vehicle, sensors)
     if camera:
-        listener.subscribe_camera(camera, vehicle.mounts[camera].camera)
+        listener.subscribe_camera(camera, cameras.mounts[camera].camera)
         print("rotate the vehicle back and forth about all axes for 10 s ...", flush=True)
         listener.spin_for(10.0)
         imu = imu_in_body(listener, sensors)
         turned = listener.turns.paired(np.array([s.stamp for s in imu]), np.array([s.w_B for s in imu]).reshape(-1, 3),
-                                       vehicle.mounts[camera].stamp_offset)
-    return checks.check_rotation(camera or next(iter(vehicle.mounts), ""), *turned, vehicle)
+                                       cameras.mounts[camera].stamp_offset)
+    return checks.check_rotation(camera or next(iter(cameras.mounts), ""), *turned, cameras)
 
 
 def active_checks(listener: Any, arguments: argparse.Namespace, bound: float = checks.STOP_TIME) -> list[Check]:
@@ -125,11 +133,12 @@ def _check(arguments: argparse.Namespace) -> int:
     if not 1.0 <= arguments.listen <= 300.0:
         raise PerchError(f"--listen: {arguments.listen:g} is outside [1, 300] s")
     vehicle = load_vehicle(arguments.vehicle)
-    if arguments.shake and arguments.shake not in vehicle.mounts:
-        raise PerchError(f"--shake: {vehicle.name} has no camera {arguments.shake!r}")
+    cameras = described_cameras(vehicle, arguments.sensors)
+    if arguments.shake and arguments.shake not in cameras.mounts:
+        raise PerchError(f"--shake: {cameras.name} has no camera {arguments.shake!r}")
     from perch_eval.preflight.ros.listener import GraphListener
 
-    with closing(GraphListener(vehicle, arguments.namespace)) as listener:
+    with closing(GraphListener(vehicle, arguments.namespace, cameras.mounts)) as listener:
         print(f"listening for {arguments.listen:g} s: the vehicle must stand still on its feet ...", flush=True)
         listener.await_first("imu/data_raw", arguments.listen)
         listener.spin_for(arguments.listen)

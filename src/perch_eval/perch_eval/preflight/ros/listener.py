@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from functools import partial
 from typing import Any
@@ -20,8 +20,7 @@ from perch_eval.preflight.checks import DESCENT_TIME, RESPONSE_TIME, CommandResu
 from perch_eval.ros.graph_node import GraphNode
 
 COMMANDS = ("motor_command", "rates_thrust_command", "attitude_thrust_command")
-CHANNELS = ("imu/data_raw", "odometry", "camera_down/camera_info", "camera_front/camera_info", "controller/status", "rotor_state",
-            "/tf_static", "/diagnostics", *COMMANDS)
+CHANNELS = ("imu/data_raw", "odometry", "controller/status", "rotor_state", "/tf_static", "/diagnostics", *COMMANDS)
 MAX_VALUES = 20_000    # of a channel
 QUEUE_DEPTH = 2000     # messages that wait while this program does not run
 TURNING_SHARE = 0.02   # of its highest speed: a rotor that is faster turns
@@ -45,19 +44,20 @@ def last_motion(sources: Sequence[Reports], last: float) -> float | None:
 
 
 class GraphListener(GraphNode):
-    """Subscribes to all channels that are checked.
+    """Subscribes to all channels that are checked: `CHANNELS`, and `camera_info` of the cameras.
 
     Attributes:
         values: channel -> (arrival by the monotonic clock [s], value), the newest `MAX_VALUES`.
         turns: rotation of the watched camera; None: no camera is watched.
     """
 
-    def __init__(self, vehicle: Vehicle, namespace: str = "") -> None:
+    def __init__(self, vehicle: Vehicle, namespace: str = "", cameras: Iterable[str] = ()) -> None:
         super().__init__("preflight", in_namespace(namespace), (signal.SIGINT, signal.SIGTERM, signal.SIGHUP))  # none leaves it armed
-        self.values: dict[str, list[tuple[float, Any]]] = {channel: [] for channel in CHANNELS}
+        self.values: dict[str, list[tuple[float, Any]]] = {
+            channel: [] for channel in (*CHANNELS, *(f"camera_{name}/camera_info" for name in cameras))}
         self.turns: CameraTurns | None = None
         self._speed_max, self._namespace = vehicle.speed_max, namespace.strip("/")
-        for channel in CHANNELS:
+        for channel in self.values:
             row = topics.topic(channel)
             profile = copy(row.qos.subscribe)
             profile.depth = max(profile.depth, QUEUE_DEPTH)
