@@ -72,10 +72,8 @@ def judge(name: str, times: np.ndarray, samples: np.ndarray, dimension: int) -> 
     """Average NEES or NIS samples over runs and compare them with their 95 % bounds.
 
     Args:
-        name: what was tested.
-        times: shape (m,) [s].
+        name, times, dimension: as in `Consistency`.
         samples: shape (runs, m); NaN where a run has none. Times at which less than half of the runs have one are left out.
-        dimension: degrees of freedom of one sample.
 
     Raises:
         ValueError: the shapes do not match.

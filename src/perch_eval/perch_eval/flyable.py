@@ -45,8 +45,7 @@ def check_flight(scenario: Scenario, source: str | Path, vehicle: Vehicle | None
     """Check that a flight of the scenario can begin and that its pad is visible from the search hover.
 
     Args:
-        scenario: to be checked.
-        source: its file, for messages.
+        scenario, source: as in `check_names`.
         vehicle: as returned by `check_names`; None: that is called here.
 
     Raises:

@@ -32,12 +32,8 @@ def programs(scenario: Scenario, seed: int = 1, *, folder: Path, scenario_source
     """Return the programs of a whole scenario.
 
     Args:
-        scenario: what is flown.
-        seed: of every random number in the flight.
-        folder: receives the parameter files.
-        scenario_source: file of the scenario, if it is not in `config/scenarios`.
-        composed: nodes that share a process, as far as the scenario has them; the others have one each.
-        lockstep: simulation time waits for all participants; otherwise the wall clock paces it.
+        scenario, seed, scenario_source, lockstep: as in `node_launches`.
+        folder, composed: as in `node_programs`.
         record: add a recorder that writes this MCAP file.
         hold_for_goal: hold simulation time until the mission has a goal.
         overrides: node -> parameter -> value, over everything else; `record` and `hold_for_goal` replace those of their nodes.

@@ -79,12 +79,8 @@ def _stop_vio(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     return "no further VIO pose"
 
 
-def _drop_trajectories(flight: ScriptedFlight) -> None:
-    flight.loop.filters["controller", "trajectory"] = lambda now, order: None
-
-
 def _stop_trajectories(flight: ScriptedFlight, rng: np.random.Generator) -> str:
-    _drop_trajectories(flight)
+    flight.loop.filters["controller", "trajectory"] = lambda now, order: None
     return "no further trajectory"
 
 
@@ -117,12 +113,8 @@ def _move_fence(flight: ScriptedFlight, rng: np.random.Generator) -> str:
     return f"the fence stands {abs(outside):.2f} m {'behind' if outside > 0 else 'ahead of'} the vehicle along {'xyz'[axis]}"
 
 
-def _missed_contact(flight: ScriptedFlight, rng: np.random.Generator) -> str:
-    return "the velcro does not hold"
-
-
 def _abort(flight: ScriptedFlight, rng: np.random.Generator) -> str:
-    _drop_trajectories(flight)
+    _stop_trajectories(flight, rng)
     if rng.random() < 0.5:
         flight.loop.request("controller", "abort", TriggerRequest())
         return "abort"
@@ -138,7 +130,7 @@ FAULTS = (
     Fault("excess tilt, rate", "a blow adds 8 to 20 rad/s about a random axis", _add_body_rate),
     Fault("low thrust margin", "all rotors weaken: the greatest thrust falls to 95 to 130 % of the weight", _weaken_rotors),
     Fault("geofence", "the fence is moved to between 0.3 m ahead of and 1.5 m behind the vehicle", _move_fence),
-    Fault("missed contact", "the velcro does not hold", _missed_contact, {"adhesion": {"enabled": False}}),
+    Fault("missed contact", "the velcro does not hold", lambda *_: "the velcro does not hold", {"adhesion": {"enabled": False}}),
     Fault("abort", "`abort`, or the goal is cancelled (HOVER)", _abort),
 )
 

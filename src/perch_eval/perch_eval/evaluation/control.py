@@ -40,7 +40,7 @@ def fault_sections(effort: Effort) -> list[Section]:
         own = [r for r in flown if r["fault"] == fault.name]
         ends, touched = Counter(r["end"] for r in own), sum(bool(r["touched"]) and r["end"] in END_STATES for r in own)
         safe = sum(ends[e] for e in END_STATES)
-        without = sum(_no_way_out(r) for r in own)
+        without = sum(r["search"] is not None and r["search"]["survived"] == 0 for r in own)
         rows.append((f"{fault.name}: {fault.description}", *(ends[e] for e in ENDINGS), without, touched))
         found = f"{safe}/{len(own)}: " + ", ".join(f"{ends[e]} {e}" for e in ENDINGS if ends[e]) + f"; {without} {NO_WAY_OUT}" * bool(without)
         out.claim(fault.name, found, "", safe + without == len(own) if own else None, "every flight ends hovering, landed or perched, or had no way out")
@@ -91,10 +91,6 @@ def comparison_sections(effort: Effort) -> list[Section]:
     write_page(effort, "comparison", text, {"flights": flown})
     out.data = {"flights": flown}
     return [out]
-
-
-def _no_way_out(r: dict[str, Any]) -> bool:
-    return r["search"] is not None and r["search"]["survived"] == 0
 
 
 def _description(r: dict[str, Any]) -> str:

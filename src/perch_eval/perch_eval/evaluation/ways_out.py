@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -72,7 +72,8 @@ def sections(effort: Effort) -> list[Section]:
         out.claim(f"{title}: a way out {NO_CONTACT_BEFORE:g} s before contact and earlier", f"{_share(early)}; {planned} of {len(plans)} planned", "",
                   planned == len(plans) and Rate.from_outcomes(not x.refusal for x in early).at_least(REQUIRED_SHARE),
                   f"at least {100 * REQUIRED_SHARE:g} %, all planned")
-    flown = cached_figures(effort, "aborted", list(_cancellations()), _fly_cancelled, lambda r: r["end"] == "hovering" or _too_late(r))
+    cancelled = [(name, k + 1, round(MAX_TIME_TO_CONTACT * (1.0 - (k + 0.5) / n), 3)) for name, n in CANCELLED_FLIGHTS.items() for k in range(n)]
+    flown = cached_figures(effort, "aborted", cancelled, _fly_cancelled, lambda r: r["end"] == "hovering" or _too_late(r))
     text = ["# Ways out", "", out.about, "", "Instants with a way out, by time to contact [s]:", "",
             *table(" | ".join(("plans", *(f"{low:g} to {high:g}" for low, high in pairwise(EDGES[:-1])), f"from {EDGES[-2]:g}", "all")), rows), "",
             "## Refused", ""]
@@ -118,13 +119,6 @@ def _span(numbers: Iterable[str]) -> str:
     """Return the range of some numbers as text; a number itself if there is no other."""
     ordered = sorted(set(numbers), key=float)
     return ordered[0] if len(ordered) == 1 else f"{ordered[0]} to {ordered[-1]}"
-
-
-def _cancellations() -> Iterator[tuple[str, int, float]]:
-    """Yield scenario, seed, and time of cancellation before the contact [s]."""
-    for name, n in CANCELLED_FLIGHTS.items():
-        for k in range(n):
-            yield name, k + 1, round(MAX_TIME_TO_CONTACT * (1.0 - (k + 0.5) / n), 3)
 
 
 def _too_late_at(scenario: str) -> float:

@@ -91,18 +91,7 @@ def arrange(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), *, repl
 
 
 def fly(scenario: Scenario, seed: int, sensing: Sensing = Sensing(), linger: float = 0.0) -> FlightTrace:
-    """Fly a scenario once.
-
-    Args:
-        scenario: scenario to be flown.
-        seed: seed of all random draws; the same seed gives bit-identical flights.
-        sensing: which cameras are rendered.
-        linger: simulated time after the goal's end [s].
-
-    Raises:
-        ConfigError: the scenario or a node's parameter is invalid.
-        PerchError: a cable sags and would need an error model, which does not exist.
-    """
+    """Fly a scenario once; arguments and errors as those of `arrange`, and `linger`: simulated time after the goal's end [s]."""
     return perch(arrange(scenario, seed, sensing), scenario, linger)
 
 

@@ -38,7 +38,7 @@ def open_recording(path: Path, sensors: Sensors | None, camera: str | None = Non
     """
     if not path.exists():
         raise RecordingError(f"{path}: no such recording")
-    if is_bag(path):
+    if path.suffix in SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file():
         return BagRecording(path, sensors)
     if path.is_dir() and root_of(path) is not None:
         return AslRecording(path, sensors)
@@ -46,11 +46,6 @@ def open_recording(path: Path, sensors: Sensors | None, camera: str | None = Non
         return ImageFolder(path, sensors, camera)
     raise RecordingError(f"{path}: is no recording: neither a bag (.bag, .mcap, .db3, a folder with metadata.yaml), nor a folder in the "
                          "format of EuRoC (mav0/cam0/data.csv), nor images")
-
-
-def is_bag(path: Path) -> bool:
-    """Whether a path is that of a bag."""
-    return path.suffix in SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
 
 
 class BagRecording(Recording):

@@ -134,13 +134,10 @@ class ImageFolder(Recording):
     def __init__(self, path: Path, sensors: Sensors | None, camera: str | None) -> None:
         """
         Raises:
-            RecordingError: there is no image.
             ConfigError: the sensor file has no such camera.
         """
         super().__init__(path, sensors)
         self.files = image_files(path)
-        if not self.files:
-            raise RecordingError(f"{path}: no image in it")
         cameras = [*sensors.cameras] if sensors is not None else ["camera"]
         if camera is not None and camera not in cameras:
             raise ConfigError("--camera, --front", camera, f"is not one of {', '.join(cameras)}")

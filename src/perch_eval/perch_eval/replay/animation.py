@@ -9,7 +9,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageChops
+from PIL.GifImagePlugin import getdata, getheader
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
@@ -135,9 +136,20 @@ def _frames(scene: Scene, times: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _write_gif(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
-    first, *others = (Image.fromarray(frame) for frame in frames)
-    ends = np.round(100.0 / fps * np.arange(1, len(others) + 2)).astype(int)  # GIF delays are multiples of 10 ms
-    first.save(path, save_all=True, append_images=others, duration=(10 * np.diff(ends, prepend=0)).tolist(), loop=0)
+    """Write each frame when it is drawn: only the box with its changes, the rest transparent. Pillow's `save_all` holds all to the end."""
+    last = None
+    with path.open("wb") as file:
+        for k, frame in enumerate(frames):
+            changed = Image.fromarray(np.ones(frame.shape[:2], bool) if last is None else (frame != last).any(axis=2))
+            box = changed.getbbox() or (0, 0, 1, 1)
+            part = Image.fromarray(frame).crop(box).quantize(255)
+            part.paste(255, mask=ImageChops.invert(changed.crop(box)))
+            if last is None:
+                file.writelines(getheader(part, info={"loop": 0})[0])
+            hundredths = round(100.0 / fps * (k + 1)) - round(100.0 / fps * k)  # the unit of delays in GIF
+            file.writelines(getdata(part, box[:2], duration=10 * hundredths, transparency=255, include_color_table=True))
+            last = frame
+        file.write(b";")
 
 
 def _write_mp4(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
