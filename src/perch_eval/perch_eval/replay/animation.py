@@ -136,19 +136,18 @@ def _frames(scene: Scene, times: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _write_gif(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
-    """Write each frame when it is drawn: only the box with its changes, the rest transparent. Pillow's `save_all` holds all to the end."""
-    last = None
+    """Write each frame when it is drawn, and of it the box that differs from the last one: Pillow's `save_all` holds all until the end."""
+    last: Image.Image | None = None
     with path.open("wb") as file:
         for k, frame in enumerate(frames):
-            changed = Image.fromarray(np.ones(frame.shape[:2], bool) if last is None else (frame != last).any(axis=2))
-            box = changed.getbbox() or (0, 0, 1, 1)
-            part = Image.fromarray(frame).crop(box).quantize(255)
-            part.paste(255, mask=ImageChops.invert(changed.crop(box)))
+            whole, delay = Image.fromarray(frame), round(100.0 / fps * (k + 1)) - round(100.0 / fps * k)  # [10 ms], the unit of GIF
             if last is None:
-                file.writelines(getheader(part, info={"loop": 0})[0])
-            hundredths = round(100.0 / fps * (k + 1)) - round(100.0 / fps * k)  # the unit of delays in GIF
-            file.writelines(getdata(part, box[:2], duration=10 * hundredths, transparency=255, include_color_table=True))
-            last = frame
+                box = (0, 0, *whole.size)
+                file.writelines(getheader(whole.quantize(), info={"loop": 0})[0])
+            else:
+                box = ImageChops.difference(whole, last).getbbox() or (0, 0, 1, 1)
+            file.writelines(getdata(whole.crop(box).quantize(), box[:2], duration=10 * delay, include_color_table=True))
+            last = whole
         file.write(b";")
 
 
