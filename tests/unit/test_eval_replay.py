@@ -9,7 +9,6 @@ import math
 import re
 import resource
 import shutil
-import weakref
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
@@ -193,26 +192,6 @@ def test_an_animation_takes_its_time(fps, tmp_path):
     with Image.open(tmp_path / "f.gif") as image:
         total = sum(frame.info["duration"] for frame in ImageSequence.Iterator(image))
     assert total == pytest.approx(1000.0 * 61 / fps, abs=10.0)
-
-
-def test_the_frames_of_a_gif_are_written_as_they_are_drawn(tmp_path, monkeypatch):
-    drawn, images, held = [], [], []
-    from_array = Image.fromarray
-    monkeypatch.setattr(animation.Image, "fromarray", lambda frame: images.append(weakref.ref(image := from_array(frame))) or image)
-
-    def frames():
-        for k in range(12):
-            drawn.append(np.full((24, 32, 3), 40, np.uint8))
-            drawn[-1][3:9, 2 + min(k, 8):6 + min(k, 8)] = (200, 10 * min(k, 8), 0)  # then it stands still
-            yield drawn[-1]
-            held.append(sum(image() is not None for image in images))
-
-    animation._write_gif(tmp_path / "f.gif", 15.0, frames())
-    assert max(held) <= 2
-    with Image.open(tmp_path / "f.gif") as found:
-        assert found.info["loop"] == 0
-        shown = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(found)]
-    np.testing.assert_array_equal(shown, drawn)
 
 
 def test_two_recordings_of_a_flight_are_the_same_flight_though_one_has_a_report(recorded, undrawn):

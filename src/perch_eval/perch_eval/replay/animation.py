@@ -9,8 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image, ImageChops
-from PIL.GifImagePlugin import getdata, getheader
+from PIL import Image
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
@@ -136,19 +135,9 @@ def _frames(scene: Scene, times: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _write_gif(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
-    """Write each frame when it is drawn, and of it the box that differs from the last one: Pillow's `save_all` holds all until the end."""
-    last: Image.Image | None = None
-    with path.open("wb") as file:
-        for k, frame in enumerate(frames):
-            whole, delay = Image.fromarray(frame), round(100.0 / fps * (k + 1)) - round(100.0 / fps * k)  # [10 ms], the unit of GIF
-            if last is None:
-                box = (0, 0, *whole.size)
-                file.writelines(getheader(whole.quantize(), info={"loop": 0})[0])
-            else:
-                box = ImageChops.difference(whole, last).getbbox() or (0, 0, 1, 1)
-            file.writelines(getdata(whole.crop(box).quantize(), box[:2], duration=10 * delay, include_color_table=True))
-            last = whole
-        file.write(b";")
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    ends = np.round(100.0 / fps * np.arange(1, len(others) + 2)).astype(int)  # GIF delays are multiples of 10 ms
+    first.save(path, save_all=True, append_images=others, duration=(10 * np.diff(ends, prepend=0)).tolist(), loop=0)
 
 
 def _write_mp4(path: Path, fps: float, frames: Iterator[np.ndarray]) -> None:
