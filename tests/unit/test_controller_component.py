@@ -300,6 +300,53 @@ def test_a_little_older_stamps_are_refused_by_the_flight_and_move_nothing():
     np.testing.assert_allclose(flight.plant.p, [0, 0, 0.6], atol=0.03)
 
 
+@pytest.mark.parametrize("back", [60_000_000, 150_000_000, 300_000_000, 900_000_000])
+def test_where_the_clock_is_set_back_the_flight_goes_on(back):
+    flight = hovering()
+    flight.follow(flight.path(flight.plant.p, (1.0, 0.0, 0.6), 1.6), id=6)
+    flight.step(0.8)
+    flight.stamp -= back
+    flight.step(0.1)
+    assert flight.state is State.TRACKING and ("time has been set back" in flight.said) == (back > 80_000_000)
+    assert flight.motors[-1].armed and flight.motors[-1].stamp == flight.stamp - flight.period
+    assert 0 <= flight.stamp - flight.status[-1].stamp <= 22_000_000
+    flight.step(1.4)
+    assert flight.state is State.HOVERING
+    np.testing.assert_allclose(flight.plant.p, [1.0, 0.0, 0.6], atol=0.03)
+    flight.follow(flight.path(flight.plant.p, (0.0, 0.0, 0.6), 1.6), id=7)
+    flight.step(2.0)
+    assert flight.state is State.HOVERING and "trajectory 7 refused" not in flight.said
+    np.testing.assert_allclose(flight.plant.p, [0.0, 0.0, 0.6], atol=0.03)
+    flight.order(Command.LAND, stamp=flight.stamp)
+    flight.step(5.0)
+    assert flight.state is State.DISARMED
+
+
+@pytest.mark.parametrize("back, odometry", [(2 * NANOSECONDS, True), (2 * NANOSECONDS, False), (300_000_000, False)])
+def test_where_the_clock_is_set_back_far_or_odometry_stops_then_the_vehicle_descends_with_its_motors_on(back, odometry):
+    flight = hovering()
+    flight.stamp -= back
+    for k in range(60):  # 1.2 s
+        flight.step(0.02, odometry=odometry)
+        flight.component.on_watchdog(77 * NANOSECONDS + k * 20_000_000)
+        assert flight.motors[-1].armed
+    assert flight.state is State.LANDING and "time has been set back" in flight.said
+    flight.step(6.0, odometry=odometry)
+    assert flight.state is State.DISARMED and flight.plant.p[2] < 0.02 and flight.plant.impact_speed < 1.5
+
+
+@pytest.mark.parametrize("late, state", [(70_000_000, State.HOVERING), (100_000_000, State.LANDING), (200_000_000, State.LANDING)])
+def test_odometry_far_behind_the_imu_is_not_flown_on(late, state):
+    flight, waiting = hovering(), []
+    for k in range(2 * late // flight.period + 50):  # it falls behind, as every other sample is late by one more
+        waiting.append(flight.odometry())
+        flight.step(0.002, odometry=False)
+        if waiting[0].stamp < flight.stamp - late or k % 2:
+            flight.component.on_odometry(waiting.pop(0))
+    assert flight.state is state and ("behind the newest stamp: late" in flight.said) == (late > 80_000_000)
+    assert flight.motors[-1].armed
+
+
 @pytest.mark.parametrize("changes", [{"f_B": (NAN, 0.0, 9.8)}, {"w_B": (1e300, 0.0, 0.0)}, {"frame": "camera_down_optical_frame"}])
 def test_imu_samples_that_cannot_be_used_are_ignored(changes):
     flight = hovering()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -25,7 +25,8 @@ from perch_control.stamp_guard import Stamp, StampGuard
 STATUS_PERIOD = 20_000_000        # of controller/status [ns]
 DIAGNOSTICS_PERIOD = NANOSECONDS
 DIAGNOSTICS_PHASE = 666_000_000   # not with the status [ns]
-BLIND_AFTER = 0.08                # without odometry for so long, IMU samples are answered; motors stop 0.1 s after the last command [s]
+BLIND_AFTER = 80_000_000          # without odometry for so long, IMU samples are answered; motors stop 0.1 s after the last command [ns]
+LATE = BLIND_AFTER                # odometry further behind the newest stamp is not flown on [ns]
 LONGEST_PLAN = 60.0               # a way out that starts later does not belong to the running trajectory [s]
 INPUTS_LOST_AFTER = NANOSECONDS   # without any input for so long, a restart of time is accepted in flight, too [ns]
 _FIXED = ("vehicle", "sensors")   # parameters that do not change after the start
@@ -118,8 +119,8 @@ class Controller(Component[ControllerParameters]):
         if taken is None or not self._stamp_accepted(sample.stamp, "imu/data_raw"):
             return
         stamp, answered = sample.stamp, self._answered
-        self.flight.imu(seconds(stamp), taken.w_B, taken.f_B)
-        if answered is None or stamp <= answered or not (self._silent or stamp - answered >= nanoseconds(BLIND_AFTER)):
+        self.flight.imu(self._flight_time(stamp), taken.w_B, taken.f_B)
+        if answered is None or stamp <= answered or not (self._silent or stamp - answered >= BLIND_AFTER):
             return
         if self.flight.state not in (State.DISARMED, State.FAILED, State.ATTACHED):
             self._answer_silence(stamp, "odometry has stopped: commands follow the IMU samples")
@@ -132,12 +133,23 @@ class Controller(Component[ControllerParameters]):
         if not self._stamp_accepted(state.stamp, "odometry"):
             return
         self._answered, self._silent = self._stamps.newest, False
-        self._answer(state.stamp, self.flight.step(seconds(state.stamp), (*state.p_WB, *state.v_WB, *state.q_WB, *state.w_B),
-                                                   (state.pose_covariance, state.twist_covariance), problem(state)))
+        late = self._stamps.newest - state.stamp
+        why = problem(state) or (f"{late * 1e-6:.0f} ms behind the newest stamp: late" if late > LATE else "")
+        self._answer(state.stamp, self.flight.step(self._flight_time(state.stamp), (*state.p_WB, *state.v_WB, *state.q_WB, *state.w_B),
+                                                   (state.pose_covariance, state.twist_covariance), why))
+
+    def _flight_time(self, stamp: int) -> float:
+        """Return the flight's time at a stamp [s]; it goes on where the clock is set back."""
+        return seconds(stamp + self._stamps.set_back)
 
     def _stamp_accepted(self, stamp: int, channel: str) -> bool:
-        """Whether a stamp is accepted. If time has restarted, a new flight begins; if it has jumped, the vehicle descends."""
+        """Whether a stamp is accepted.
+
+        If time has restarted, a new flight begins. If it has jumped ahead, or back by more than `STALE`, the vehicle descends. If the
+        clock was set back by less, the flight goes on, as far as odometry does.
+        """
         may_restart = not self.flight.flight_state.flying or self._silence >= INPUTS_LOST_AFTER
+        before, set_back = self._stamps.newest, self._stamps.set_back
         verdict = self._stamps.check(stamp, channel, may_restart)
         if verdict is Stamp.REFUSED:
             newest = seconds(self._stamps.newest)
@@ -151,6 +163,14 @@ class Controller(Component[ControllerParameters]):
             self._begin()
             if self._map_stamp > stamp + STALE:  # of the time before; an old one, which may be published only once, stays valid
                 self._assembly.set_lines(())
+        elif verdict is Stamp.SET_BACK:
+            self.warn(f"{channel}: time has been set back to {seconds(stamp):.3f} s")
+            by = self._stamps.set_back - set_back
+            self._command_stamp -= by
+            self._answered = self._answered and self._answered - by
+            self._first = self._first and self._first - by
+            if before - stamp > STALE:
+                self.flight.descend("time has been set back")
         elif verdict is Stamp.AHEAD:
             self.warn(f"{channel}: time has jumped ahead to {seconds(stamp):.3f} s")
             self.flight.descend("time has jumped ahead")
@@ -163,21 +183,21 @@ class Controller(Component[ControllerParameters]):
         if self._silent_since is None or now < self._silent_since:
             self._silent_since = now
         self._silence = now - self._silent_since
-        if self.flight.flight_state.flying and self._silence >= nanoseconds(BLIND_AFTER):
+        if self.flight.flight_state.flying and self._silence >= BLIND_AFTER:
             self._answer_silence(self._stamps.newest + self._silence, "neither odometry nor IMU: descending by the clock")
 
     def _answer_silence(self, stamp: int, why: str) -> None:
         if not self._silent:
             self._silent = True
             self.warn(why)
-        self._answer(stamp, self.flight.step_blind(seconds(stamp)))
+        self._answer(stamp, self.flight.step_blind(self._flight_time(stamp)))
 
     # -- orders ------------------------------------------------------------------------------------------------------
 
     def on_trajectory(self, order: TrajectoryOrder) -> None:
         """Follow a trajectory from its start on, or report why it is refused."""
         try:
-            self.flight.follow(self._assembly.order(order))
+            self.flight.follow(self._assembly.order(self._in_flight_time(order)))
         except PerchError as error:
             self.flight.report_refusal(f"trajectory {order.id} refused: {error}")
             self.warn(self.flight.flight_state.message)
@@ -188,9 +208,16 @@ class Controller(Component[ControllerParameters]):
             if (start := order.trajectory.start_time) > seconds(self._stamps.newest) + LONGEST_PLAN:
                 raise PerchError(f"it starts at {start:.1f} s, long after the running trajectory")
             way_out = order._replace(at_end=AtEnd.HOLD, contact_time=0.0, recovery_start=0.0)
-            self.flight.keep_ready(self._assembly.order(way_out))
+            self.flight.keep_ready(self._assembly.order(self._in_flight_time(way_out)))
         except PerchError as error:
             self.warn(f"way out of trajectory {order.id} refused: {error}")
+
+    def _in_flight_time(self, order: TrajectoryOrder) -> TrajectoryOrder:
+        """Return an order that starts at the flight's time."""
+        if not self._stamps.set_back:
+            return order
+        start = order.trajectory.start_time + seconds(self._stamps.set_back)
+        return order._replace(trajectory=replace(order.trajectory, start_time=start))
 
     def on_command(self, command: ControllerCommand) -> None:
         """Carry out a command, or report why it is refused. A stale command is ignored."""
@@ -215,7 +242,7 @@ class Controller(Component[ControllerParameters]):
             raise CommandRefused("arm is refused: no vehicle has subscribed to the commands yet")
         if self._answered is None or self.flight.state not in (State.DISARMED, State.ATTACHED):
             return
-        if self._stamps.newest + self._silence - self._answered >= nanoseconds(BLIND_AFTER):
+        if self._stamps.newest + self._silence - self._answered >= BLIND_AFTER:
             raise CommandRefused("arm is refused: no usable odometry")
 
     def on_powerlines(self, lines: PowerlineMap) -> None:

@@ -61,7 +61,8 @@ def _topics() -> Iterator[str]:
                 takers.setdefault(topics.topic(channel).channel, {}).setdefault(port.value.__name__, []).append(node)
     yield from ("## Topics", "", *table("topic | value | message | taken by | largest message [bytes] | most read per second | queue length", (
         (f"`{row.channel}`", value, _type_name(row.message), ", ".join(dict.fromkeys(nodes)),
-         f"{row.size_max >> 20} Mi" if row.size_max >= 1 << 20 else f"{row.size_max >> 10} Ki", row.rate_max or "all", row.qos.subscribe.depth)
+         f"{row.size_max >> 20} Mi" if row.size_max >= 1 << 20 else f"{row.size_max >> 10} Ki",
+         f"{row.rate_max} of a kind" if row.kind else row.rate_max or "all", row.qos.subscribe.depth or "all")
         for row in topics.TOPICS for value, nodes in takers.get(row.channel, {}).items())), "")
 
 

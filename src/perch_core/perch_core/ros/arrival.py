@@ -41,7 +41,14 @@ class ArrivalNode(ComponentNode):
         if deadline:
             load_cached(component.__module__.partition(".")[0], "perch_core")
             self._deadlines = deadlines = Deadlines()
-            getattr(self.component, deadline).receivers.append(lambda value: deadlines.record_answer(value.stamp, time.monotonic_ns()))
+            receivers = getattr(self.component, deadline).receivers
+            emit, = receivers
+
+            def answer(value: Any) -> None:
+                emit(value)
+                deadlines.record_answer(value.stamp, time.monotonic_ns())
+
+            receivers[:] = [answer]  # not one more, which would count as a receiver
 
     def connect(self) -> None:
         """As in `ComponentNode`."""

@@ -25,7 +25,7 @@ from perch_core.ros.jobs import Jobs
 from perch_core.ros.late_service import LateService
 from perch_core.ros.messages.diagnostics import diagnostics_message
 from perch_core.ros.parameters import Parameters
-from perch_core.ros.wiring import Publication, Wiring, foreign_publishers
+from perch_core.ros.wiring import Publication, Wiring, foreign_publishers, is_observer
 from rclpy.action import GoalResponse
 from rclpy.clock import Clock, ClockType
 from rcl_interfaces.msg import SetParametersResult
@@ -150,14 +150,21 @@ class ComponentNode(Node):
             emitter = getattr(self.component, port.name)
             self.wiring.register_writer(publisher.topic_name, self.get_fully_qualified_name())
             emitter.receivers.append(self._emit_function(publisher.topic_name, publication))
-            emitter.receiver_check = self._receiver_check(emitter, publisher.topic_name, publication)
+            emitter.receiver_check = partial(self._has_receivers, emitter, publisher.topic_name, publication, row)
 
     def _emit_function(self, topic: str, publication: Publication) -> Callable[[Any], None]:
         return partial(self.wiring.emit, topic, publication)
 
-    def _receiver_check(self, emitter: Emitter[Any], topic: str, publication: Publication) -> Callable[[], bool]:
-        """Return a check whether an output has a receiver: a neighbour, a subscriber, or one besides this host."""
-        return lambda: len(emitter.receivers) > 1 or self.wiring.has_reader(topic) or publication.has_subscribers()
+    def _has_receivers(self, emitter: Emitter[Any], topic: str, publication: Publication, row: topics.Topic) -> bool:
+        """Return whether an output has a receiver: a neighbour, a subscriber, or one besides this host.
+
+        Of commands to a vehicle, those who only observe are none.
+        """
+        if len(emitter.receivers) > 1 or self.wiring.has_reader(topic, observers=not row.obeyed):
+            return True
+        if not row.obeyed:
+            return publication.has_subscribers()
+        return any(not is_observer(info.node_name) for info in self.get_subscriptions_info_by_topic(topic))
 
     # -- requests ----------------------------------------------------------------------------------------------------
 

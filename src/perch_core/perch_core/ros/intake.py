@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -20,13 +21,16 @@ MATCH_PERIOD = 1.0  # of the check of the publishers' reliability for raw inputs
 TAKE_PERIOD = 0.02  # lazy inputs are read at least this often [s]
 TAKE_MAX = 200      # messages of one lazy input that are read at a time: a flood leaves time for other events
 SHARED_TOPICS = ("/tf", "/tf_static")  # channels with many publishers, inside this process and outside
+OPEN_TOPICS = ("controller/command",)  # channels on which nodes outside of this process, as a ground station, are obeyed as well as a neighbour
+OWN_KEPT = 200      # values of a neighbour on an open topic that are recognised where they return through the middleware
 
 
 class Intake:
     """Subscriptions of one node. Messages of lazy inputs wait in the middleware until the next input that is not lazy.
 
     Attributes:
-        private: resolved names of topics that a neighbour publishes; their values are passed in the process, others ignored.
+        private: resolved names of topics that a neighbour publishes; their values are passed in the process, others ignored,
+            except on `OPEN_TOPICS`.
     """
 
     def __init__(self, node: ComponentNode) -> None:
@@ -44,14 +48,18 @@ class Intake:
             node.get_logger().warning(f"{error}: not subscribed")
             return
         resolved = node.resolve_topic_name(channel)
-        if self._wiring.writer(resolved) is not None and channel not in SHARED_TOPICS:
-            self.private.add(resolved)
-            receive_local = self._local_receiver(port, row, channel, resolved, port.handler(node.component))
-            self._wiring.add_reader(resolved, partial(node.guarded, port.name, receive_local))
-            return
         handler = partial(node.guarded, port.name, port.handler(node.component))
+        own: deque[Any] = deque(maxlen=OWN_KEPT)
+        if self._wiring.writer(resolved) is not None and channel not in SHARED_TOPICS:
+            recorded = port.value is Serialized
+            receive_local = self._local_receiver(port, row, channel, resolved, port.handler(node.component))
+            self._wiring.add_reader(resolved, partial(node.guarded, port.name, receive_local), observer=recorded)
+            if recorded or channel not in OPEN_TOPICS:
+                self.private.add(resolved)
+                return
+            self._wiring.add_reader(resolved, own.append)
         if port.value is not Serialized:
-            self._subscribe(port, row, _Reader(node, channel, row, handler), row.qos.subscribe)
+            self._subscribe(port, row, _Reader(node, channel, row, handler, own), row.qos.subscribe)
             return
         receive = partial(self._receive_raw, row, channel, resolved, handler)
         subscription = self._subscribe(port, row, receive, qos.recording_profile(row.qos))
@@ -114,28 +122,35 @@ class Intake:
 
 
 class _Reader:
-    """Reads the messages of a topic, at most as many per second as its row allows."""
+    """Reads the messages of a topic, at most as many per second as its row allows, without those values of neighbours that are in `own`."""
 
-    def __init__(self, node: ComponentNode, channel: str, row: topics.Topic, handler: Callable[[Any], None]) -> None:
-        self._node, self._channel, self._row, self._handler = node, channel, row, handler
-        self._second, self._count = 0, 0
+    def __init__(self, node: ComponentNode, channel: str, row: topics.Topic, handler: Callable[[Any], None], own: deque[Any]) -> None:
+        self._node, self._channel, self._row, self._handler, self._own = node, channel, row, handler, own
+        self._second = 0
+        self._counts: Counter[Any] = Counter()  # messages of each kind in this second
 
     def __call__(self, data: bytes) -> None:
         """Pass the values of a serialised message to the handler."""
         try:
-            if self._row.rate_max:
+            if self._row.rate_max and self._row.kind is None:
                 self._check_rate()
             value = self._row.read(data)
+            if self._row.kind is not None:
+                self._check_rate(self._row.kind(value))
         except Exception as error:
             self._node.log_refusal(self._channel, error)
             return
         for one in value if isinstance(value, list) else (value,):
-            self._handler(one)
+            if one in self._own:
+                self._own.remove(one)
+            else:
+                self._handler(one)
 
-    def _check_rate(self) -> None:
+    def _check_rate(self, kind: Any = None) -> None:
         second = int(time.monotonic())
         if second != self._second:
-            self._second, self._count = second, 0
-        self._count += 1
-        if self._count > self._row.rate_max:
+            self._second = second
+            self._counts.clear()
+        self._counts[kind] += 1
+        if self._counts[kind] > self._row.rate_max:
             raise PerchError(f"more than {self._row.rate_max} messages in a second")

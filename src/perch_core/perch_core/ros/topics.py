@@ -54,6 +54,8 @@ class Topic:
         observed: no component in flight waits for it.
         size_max: greatest size of a message that is read [bytes].
         rate_max: greatest number of messages per second that a node reads; 0: no limit.
+        kind: kind of a value; `rate_max` then holds for each kind, so that a flood of one does not displace another. None: all are one.
+        obeyed: a command that moves the vehicle; it has no receiver while all of them only observe.
         packed: `to_message` returns the serialised message and `to_value` reads it, without rclpy's objects: frequent topics and images.
         """
 
@@ -64,8 +66,10 @@ class Topic:
     to_value: Convert
     packed: bool = False
     observed: bool = False
+    obeyed: bool = False
     size_max: int = 256 << 10
     rate_max: int = 0
+    kind: Convert | None = None
 
     def read(self, data: bytes) -> Any:
         """Return the value of a serialised message, or a list of values.
@@ -116,12 +120,13 @@ TOPICS = (
     Topic("powerlines", PowerlineArray, qos.LATCHED, perching.map_message, perching.map_value, rate_max=100),
     Topic("trajectory", Trajectory, qos.ORDER, flight.order_message, flight.order_value, size_max=TRAJECTORY_MAX, rate_max=50),
     Topic("recovery", Trajectory, qos.ORDER, flight.order_message, flight.order_value, size_max=TRAJECTORY_MAX, rate_max=50),
-    Topic("controller/command", ControllerCommand, qos.ORDER, flight.command_message, flight.command_value, rate_max=500),
+    Topic("controller/command", ControllerCommand, qos.COMMAND, flight.command_message, flight.command_value, rate_max=500,
+          kind=lambda value: value.command),
     Topic("controller/status", ControllerStatus, qos.STATE, flight.status_message, flight.status_value),
     Topic("controller/reference", ControlReference, qos.STATE, flight.reference_message, flight.reference_value, observed=True),
-    Topic("motor_command", MotorCommand, qos.SENSOR, fast.pack_motor, fast.unpack_motor, packed=True),
-    Topic("rates_thrust_command", RatesThrust, qos.SENSOR, fast.pack_rates, fast.unpack_rates, packed=True),
-    Topic("attitude_thrust_command", AttitudeThrust, qos.SENSOR, fast.pack_attitude, fast.unpack_attitude, packed=True),
+    Topic("motor_command", MotorCommand, qos.SENSOR, fast.pack_motor, fast.unpack_motor, packed=True, obeyed=True),
+    Topic("rates_thrust_command", RatesThrust, qos.SENSOR, fast.pack_rates, fast.unpack_rates, packed=True, obeyed=True),
+    Topic("attitude_thrust_command", AttitudeThrust, qos.SENSOR, fast.pack_attitude, fast.unpack_attitude, packed=True, obeyed=True),
     Topic("rotor_state", RotorState, qos.SENSOR, fast.pack_rotors, fast.unpack_rotors, packed=True, observed=True),
     Topic("contact", Contact, qos.EVENT, states.contact_message, states.contact_value),
     Topic("ground_truth/odometry", Odometry, qos.SENSOR, fast.pack_odometry, fast.unpack_odometry, packed=True, observed=True),

@@ -18,6 +18,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 UNNAMED = "_NODE_NAME_UNKNOWN_"  # of rcl, for a publisher that was discovered before its node
+OBSERVERS = ("recorder", "viewer", "preflight", "rosbag2_", "foxglove_bridge", "rqt_", "plotjuggler", "_")
+"""Beginnings of the names of nodes that only observe. A leading underscore hides a node, as those of the command line `ros2`."""
 CHECK_PERIOD = 0.1     # of the check for subscribers, which takes 5 us [s]
 BUNDLE_PERIOD = 0.008  # of the publication of messages without urgency [s]
 
@@ -74,6 +76,7 @@ class Wiring:
 
     def __init__(self) -> None:
         self._neighbours: dict[str, list[Receive]] = {}
+        self._followed: set[str] = set()    # topics with a neighbour that does more than observe
         self._writers: dict[str, str] = {}  # topic -> node of this process that publishes it
         self._queue: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
         self._outgoing: deque[tuple[Publication, Any]] = deque()
@@ -96,13 +99,15 @@ class Wiring:
         """Return the node of this process that publishes a topic, or None."""
         return self._writers.get(topic)
 
-    def add_reader(self, topic: str, receive: Receive) -> None:
-        """Pass every value of a topic that is published in this process to `receive`."""
+    def add_reader(self, topic: str, receive: Receive, observer: bool = False) -> None:
+        """Pass every value of a topic that is published in this process to `receive`; `observer`: which only records it."""
         self._neighbours.setdefault(topic, []).append(receive)
+        if not observer:
+            self._followed.add(topic)
 
-    def has_reader(self, topic: str) -> bool:
-        """Return whether a node of this process receives a topic directly."""
-        return topic in self._neighbours
+    def has_reader(self, topic: str, observers: bool = True) -> bool:
+        """Return whether a node of this process receives a topic directly; `observers`: also one that only records it."""
+        return topic in (self._neighbours if observers else self._followed)
 
     # -- working -----------------------------------------------------------------------------------------------------
 
@@ -150,6 +155,11 @@ class Wiring:
         self._pending.append((work, *arguments))
         if self._executor is not None:  # read after the work is queued: either this call or `run_on` of another thread finds it
             self.run_on(self._executor)
+
+
+def is_observer(node: str) -> bool:
+    """Return whether a node only observes, by its name; one that was discovered before its name may be a vehicle."""
+    return node.startswith(OBSERVERS) and node != UNNAMED
 
 
 def foreign_publishers(node: Node, topic: str, known: set[str]) -> list[str]:
