@@ -257,7 +257,7 @@ class Component(Generic[C]):
         """Apply new parameters in flight; only those named in `changeable` can differ.
 
         Raises:
-            ConfigError: a value is refused; the old parameters remain in effect.
+            PerchError: a value is refused; the old parameters remain in effect. After any other exception the host applies them again.
         """
         self.config = config
 
