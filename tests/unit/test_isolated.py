@@ -64,6 +64,12 @@ def eat_in_pieces():
     while True:
         kept.append(bytearray(1 << 26))
 
+def casadi_eats():
+    try:
+        raise RuntimeError("std::bad_alloc")
+    except RuntimeError as error:
+        raise PlanningRefusal("solver", "numerics", -1.0, f"planning failed: {error}") from error
+
 def unsendable():
     return lambda: 0
 
@@ -199,6 +205,15 @@ def test_the_memory_of_a_job_is_bounded(jobs: ModuleType) -> None:
         assert submit(runner, jobs.double, 1).result(60) == 2
     finally:
         runner.close()
+
+
+@pytest.mark.parametrize("name", ["eat", "casadi_eats"])
+def test_a_process_that_ran_out_of_memory_is_replaced(lasting: IsolatedRunner, jobs: ModuleType, name: str) -> None:
+    _, child, supervisor = submit(lasting, jobs.loaded).result(120.0)
+    with pytest.raises(JobFailed, match="out of memory: the limit of its process is 4 GiB"):
+        submit(lasting, getattr(jobs, name)).result(60)
+    loaded, other, same = submit(lasting, jobs.loaded).result(120.0)
+    assert other != child and (loaded, same) == (["kernels"], supervisor)
 
 
 def test_a_job_that_cannot_be_sent_says_so(lasting: IsolatedRunner) -> None:
