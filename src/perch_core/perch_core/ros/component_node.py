@@ -229,7 +229,12 @@ class ComponentNode(Node):
 
         def reply(value: Any) -> None:
             nonlocal answered
-            answer(row.answer_message(value))
+            try:
+                message = row.answer_message(value)
+            except Exception as error:  # replies may come later, where nobody else would answer
+                self.log_refusal(row.channel, error)
+                message = self._bad_request(row, f"the answer has no message: {error}")
+            answer(message)
             answered = True
 
         try:
