@@ -248,6 +248,18 @@ def test_killed_while_it_is_idle_it_is_replaced(runner: IsolatedRunner, jobs: Mo
     assert submit(runner, jobs.double, 1).result(60) == 2
 
 
+def test_an_answer_that_cannot_be_received_fails_and_the_next_job_is_done(runner: IsolatedRunner, jobs: ModuleType,
+                                                                          monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_memory(_: bytes) -> Any:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(isolated, "_decode_answer", no_memory)
+        with pytest.raises(JobFailed, match="double: its answer cannot be received: MemoryError"):
+            submit(runner, jobs.double, 1).result(120.0)
+    assert submit(runner, jobs.double, 1).result(120.0) == 2
+
+
 def test_closing_in_the_middle_of_a_job_leaves_no_process(runner: IsolatedRunner, jobs: ModuleType, tmp_path: Path) -> None:
     submit(runner, jobs.spawn).result(120.0)
     pid, running, waiting = runner.pid, hanging(runner, jobs, tmp_path), submit(runner, jobs.double, 1)

@@ -29,7 +29,8 @@ def _profile(depth: int, latched: bool = False, reliable: bool = True) -> QoSPro
 SENSOR = Qos(_profile(200), _profile(200, reliable=False))        # imu, odometry, motor_command: up to 1000 Hz
 IMAGE = Qos(_profile(5), _profile(5, reliable=False))             # images, camera_info
 STATE = Qos(_profile(50), _profile(50))                           # statuses, results of perception
-ORDER = Qos(_profile(50), _profile(50))                           # trajectories, commands
+ORDER = Qos(_profile(50), _profile(50))                           # trajectories
+COMMAND = Qos(_profile(500), _profile(500))                       # commands: all that may come while a node is busy for a second
 LATCHED = Qos(_profile(1, latched=True), _profile(1, latched=True))         # facts, the newest map
 EVENT = Qos(_profile(100, latched=True), _profile(100, latched=True))       # contacts: all of them, also for late subscribers
 STATIC = Qos(_profile(50, latched=True), _profile(50, latched=True))        # /tf_static

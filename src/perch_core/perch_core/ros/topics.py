@@ -116,7 +116,7 @@ TOPICS = (
     Topic("powerlines", PowerlineArray, qos.LATCHED, perching.map_message, perching.map_value, rate_max=100),
     Topic("trajectory", Trajectory, qos.ORDER, flight.order_message, flight.order_value, size_max=TRAJECTORY_MAX, rate_max=50),
     Topic("recovery", Trajectory, qos.ORDER, flight.order_message, flight.order_value, size_max=TRAJECTORY_MAX, rate_max=50),
-    Topic("controller/command", ControllerCommand, qos.ORDER, flight.command_message, flight.command_value, rate_max=500),
+    Topic("controller/command", ControllerCommand, qos.COMMAND, flight.command_message, flight.command_value, rate_max=500),
     Topic("controller/status", ControllerStatus, qos.STATE, flight.status_message, flight.status_value),
     Topic("controller/reference", ControlReference, qos.STATE, flight.reference_message, flight.reference_value, observed=True),
     Topic("motor_command", MotorCommand, qos.SENSOR, fast.pack_motor, fast.unpack_motor, packed=True),
