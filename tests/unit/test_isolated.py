@@ -64,6 +64,12 @@ def eat_in_pieces():
     while True:
         kept.append(bytearray(1 << 26))
 
+def casadi_eats():
+    try:
+        raise RuntimeError("std::bad_alloc")
+    except RuntimeError as error:
+        raise PlanningRefusal("solver", "numerics", -1.0, f"planning failed: {error}") from error
+
 def unsendable():
     return lambda: 0
 
@@ -201,6 +207,15 @@ def test_the_memory_of_a_job_is_bounded(jobs: ModuleType) -> None:
         runner.close()
 
 
+@pytest.mark.parametrize("name", ["eat", "casadi_eats"])
+def test_a_process_that_ran_out_of_memory_is_replaced(lasting: IsolatedRunner, jobs: ModuleType, name: str) -> None:
+    _, child, supervisor = submit(lasting, jobs.loaded).result(120.0)
+    with pytest.raises(JobFailed, match="out of memory: the limit of its process is 4 GiB"):
+        submit(lasting, getattr(jobs, name)).result(60)
+    loaded, other, same = submit(lasting, jobs.loaded).result(120.0)
+    assert other != child and (loaded, same) == (["kernels"], supervisor)
+
+
 def test_a_job_that_cannot_be_sent_says_so(lasting: IsolatedRunner) -> None:
     with pytest.raises(JobFailed, match="cannot be sent"):
         submit(lasting, lambda: 0).result(120.0)
@@ -231,6 +246,18 @@ def test_killed_while_it_is_idle_it_is_replaced(runner: IsolatedRunner, jobs: Mo
     supervisor = runner.pid
     os.kill(supervisor if whom == "supervisor" else submit(runner, jobs.loaded).result(120.0)[1], signal.SIGKILL)
     assert submit(runner, jobs.double, 1).result(60) == 2
+
+
+def test_an_answer_that_cannot_be_received_fails_and_the_next_job_is_done(runner: IsolatedRunner, jobs: ModuleType,
+                                                                          monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_memory(_: bytes) -> Any:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(isolated, "_decode_answer", no_memory)
+        with pytest.raises(JobFailed, match="double: its answer cannot be received: MemoryError"):
+            submit(runner, jobs.double, 1).result(120.0)
+    assert submit(runner, jobs.double, 1).result(120.0) == 2
 
 
 def test_closing_in_the_middle_of_a_job_leaves_no_process(runner: IsolatedRunner, jobs: ModuleType, tmp_path: Path) -> None:

@@ -112,9 +112,9 @@ def test_an_answer_that_comes_after_its_request_was_dropped_is_not_that_of_the_n
     asking, replies = participant(executor, Asking), created(executor, ArrivalNode, Serving).component.replies
     asking.component.plan_perch(REQUEST, 0)
     until(executor, lambda: len(replies) == 1)
-    with monkeypatch.context() as patched:  # the node's timer would drop the next one, too
-        patched.setattr("perch_sim.ros.participant_node.ANSWER_TIMEOUT", -1.0)
-        asking._check_requests()
+    with monkeypatch.context() as patched:  # the next one is not dropped
+        patched.setattr("perch_core.ros.service_clients.ANSWER_TIMEOUT", -1.0)
+        until(executor, asking._open_requests[0].answer.done)
     asking.component.plan_perch(REQUEST, 0)
     first, second = answered(executor, asking, replies, "late", "second")
     assert "has not answered" in first and second == "second"

@@ -10,13 +10,16 @@ import pytest
 import rclpy
 from perch_core.component import Component
 from perch_core.config import choice, derived, quantity, text
-from perch_core.errors import ConfigError
+from perch_core.errors import ConfigError, PerchError
 from perch_core.registry import resolved
-from perch_core.ros.node import NodeSpec, _warn_unused_parameter_files
+from perch_core.ros.node import NodeSpec, _warn_unused_parameter_files, spin_until_stopped
 from perch_core.ros.parameters import _leaves
 from perch_eval.in_process.parameters import COMPONENTS
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
@@ -42,7 +45,11 @@ class Tuned(Component[Config]):
     def reconfigure(self, config):
         if config.gain == 7.0:
             raise ConfigError("", "gain", "7 shakes the frame")
+        if config.gain == 8.0:
+            raise PerchError("no law can be built for 8")
         super().reconfigure(config)
+        if config.gain == 9.0:
+            raise ZeroDivisionError("a defect, after a part has changed")
 
 
 class Graph:
@@ -99,7 +106,8 @@ def test_types_ranges_units_and_what_is_fixed_are_described(graph):
 
 
 @pytest.mark.parametrize("name, value, words", [
-    ("gain", 11.0, "10"), ("gain", 0.0, "gain"), ("gain", 7.0, "7 shakes the frame"), ("gain", "much", "gain"), ("gain", float("nan"), "gain"),
+    ("gain", 11.0, "10"), ("gain", 0.0, "gain"), ("gain", 7.0, "7 shakes the frame"), ("gain", "much", "gain"),
+    ("gain", 8.0, "no law can be built"), ("gain", 9.0, "ZeroDivisionError: a defect"), ("gain", float("nan"), "gain"),
     ("count", 10, "9"), ("count", 2.5, "count"), ("law", "middling", "'middling' is not one of slow, fast"), ("weights", [1.0, -1.0], "weights"),
     ("weights", ["heavy"], "weights"), ("vehicle", "snapdragon", "vehicle"), ("no_such_gain", 1.0, "no_such_gain")])
 def test_a_refused_value_changes_nothing_and_says_why(graph, name, value, words):
@@ -110,6 +118,42 @@ def test_a_refused_value_changes_nothing_and_says_why(graph, name, value, words)
     if known:
         assert (graph.describe(name), graph.get(name)) == before
         assert graph.tuned.component.config == Config()
+
+
+def test_a_change_that_raises_counts_as_a_failure_and_one_that_is_refused_does_not(graph):
+    graph.set("gain", 8.0)
+    assert graph.tuned._failures == 0
+    graph.set("gain", 9.0)
+    assert graph.tuned._failures == 1 and graph.set("gain", 5.0).successful
+
+
+def test_a_parameter_of_an_unknown_type_does_not_end_the_node(graph):
+    client = graph.asker.create_client(SetParameters, "tuned/set_parameters")
+    unknown = Parameter("gain", value=3.0).to_parameter_msg()
+    unknown.value = ParameterValue(type=99)
+    assert graph.answer(client.call_async(SetParameters.Request(parameters=[unknown]))).results == []
+    assert graph.tuned._failures == 1 and graph.set("gain", 4.5).successful and graph.get("gain") == 4.5
+
+
+def test_an_exception_that_leaves_a_callback_does_not_end_the_node(graph, monkeypatch):
+    executor, ticks = EventsExecutor(context=graph.context), []
+    graph.executor.remove_node(graph.tuned), executor.add_node(graph.tuned)
+
+    def tick():
+        ticks.append(1)
+        if len(ticks) == 2:
+            raise ZeroDivisionError("a defect")
+
+    class Stop:
+        end = time.monotonic() + PATIENCE
+
+        def __bool__(self):
+            return len(ticks) > 3 or time.monotonic() > self.end
+
+    graph.tuned.create_timer(0.01, tick)
+    monkeypatch.setattr("rclpy.ok", lambda: True)  # of this context
+    spin_until_stopped(executor, Stop(), graph.tuned.log_refusal)
+    assert len(ticks) > 3 and graph.tuned._failures == 1
 
 
 @pytest.mark.parametrize("name, value, got", [("gain", 4.5, 4.5), ("gain", 5, 5.0), ("weights", [3, 4], [3.0, 4.0]), ("weights", [0.5], [0.5]),

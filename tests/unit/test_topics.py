@@ -8,13 +8,16 @@ import pytest
 from perch_core.component import Action, Client, Component, Input, Output, Service, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
+from perch_core.ros.arrival import ArrivalNode
 from perch_core.ros.goal_server import ServedGoal
 from perch_core.ros.intake import Intake
 from perch_core.ros.messages.sensing import imu_value
-from perch_core.values import AttitudeThrust, ImuSample, InertialState, MotorCommand, OdometryState, RatesThrust, RotorState
+from perch_core.ros.wiring import Wiring
+from perch_core.values import AttitudeThrust, ControllerCommand, ImuSample, InertialState, MotorCommand, OdometryState, RatesThrust, RotorState
 from perch_msgs.action import Perch
 from perch_sim.scenario import NODES
 from unit.rclpy_messages import message_of
+from unit.test_requests_of_nodes import Nothing, until
 from rclpy.serialization import deserialize_message, serialize_message
 
 RNG = np.random.default_rng(3)
@@ -140,3 +143,33 @@ def test_an_observer_refuses_bytes_that_are_no_message_and_goes_on():
     for data in (b"\0\1\0\0", topics.encode("odometry", _odometry())):
         intake._receive_raw(row, "odometry", "/odometry", seen.append, data)
     assert [value.stamp for value in seen] == [5_000_000_123] and [channel for channel, _ in refused] == ["odometry"]
+
+
+@pytest.mark.parametrize("channel", ["controller/command", "trajectory", "recovery"])
+def test_the_queue_of_an_order_holds_all_that_is_read_in_a_second(channel):
+    row = topics.topic(channel)
+    assert row.rate_max and min(one.depth for one in row.qos) >= row.rate_max
+
+
+class Commanded(Component[Nothing]):
+    """Keeps its commands."""
+
+    config_type = Nothing
+    command = Input(ControllerCommand, "controller/command")
+
+    def on_command(self, command: ControllerCommand) -> None:
+        """Keep it."""
+        self.reasons = [*getattr(self, "reasons", []), command.reason]
+
+
+def test_no_command_is_lost_while_the_controller_is_busy(executor):
+    controller, row = ArrivalNode("commanded", Commanded, Wiring(), context=executor.context), topics.topic("controller/command")
+    controller.connect()
+    executor.add_node(controller)
+    publisher = controller.create_publisher(row.message, row.channel, row.qos.publish)
+    until(executor, publisher.get_subscription_count)
+    sent = [str(k) for k in range(200)]
+    for reason in sent:  # nobody reads them meanwhile
+        publisher.publish(row.to_message(ControllerCommand(1, 1, reason)))
+    until(executor, lambda: sent[-1] in getattr(controller.component, "reasons", []))
+    assert controller.component.reasons == sent

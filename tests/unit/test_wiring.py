@@ -20,6 +20,32 @@ def test_a_value_without_a_message_is_dropped_and_the_others_are_published():
     assert len(sent) == 2 and failures == [("/imu", struct.error)]
 
 
+def test_a_value_that_the_middleware_refuses_is_dropped_and_the_others_are_published():
+    sent, failures, wiring = [], [], Wiring()
+
+    def publish(message):
+        if message == 1:
+            raise RuntimeError("failed to publish")
+        sent.append(message)
+
+    publisher = SimpleNamespace(topic_name="/imu", publish=publish)
+    publication = Publication(publisher, int, True, lambda topic, error: failures.append((topic, str(error))))
+    wiring.enter(lambda: [wiring.emit("/imu", publication, value) for value in (0, 1, 2)])
+    assert sent == [0, 2] and failures == [("/imu", "failed to publish")]
+
+
+def test_work_that_raises_delays_nothing_that_follows():
+    done, failures, wiring = [], [], Wiring()
+    wiring.on_failure = lambda name, error: failures.append(str(error))
+
+    def fail():
+        wiring.enter(done.append, "follows")
+        raise RuntimeError("failed to take a message")
+
+    wiring.enter(fail)
+    assert done == ["follows"] and failures == ["failed to take a message"]
+
+
 def test_work_that_a_thread_queues_while_the_executor_is_set_is_not_lost():
     """A job may end between the thread's look for the executor and its entry into the queue, which the executor has taken by then."""
     wiring, done = Wiring(), []

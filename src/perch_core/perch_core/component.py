@@ -140,7 +140,7 @@ class Client(_Port, Generic[Q, A]):
     """Client port: `self.<name>(request, due)` sends a request; the answer is passed to `on_<name>(request, answer)`.
 
     In simulation, where work takes no simulated time, the answer is delivered at the stamp `due` [ns]; elsewhere, as soon as it
-    is available. Where the server is missing or fails, the answer is `Unavailable`.
+    is available. Where the server is missing, fails or does not answer within 50 s, the answer is `Unavailable`.
     """
 
     def __init__(self, request: type[Q], answer: type[A], channel: str) -> None:
@@ -257,7 +257,7 @@ class Component(Generic[C]):
         """Apply new parameters in flight; only those named in `changeable` can differ.
 
         Raises:
-            ConfigError: a value is refused; the old parameters remain in effect.
+            PerchError: a value is refused; the old parameters remain in effect. After any other exception the host applies them again.
         """
         self.config = config
 

@@ -251,6 +251,9 @@ class IsolatedRunner:
             self._restart()
             self._tasks.appendleft(task)
             return
+        except Exception as error:  # no memory for the answer: this thread must go on
+            self._restart()
+            kind, answer = b"F", f"its answer cannot be received: {type(error).__name__}: {error}"
         if kind == b"A":
             task.future.set_result(answer)
         elif kind == b"E":

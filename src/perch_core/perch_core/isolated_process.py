@@ -21,30 +21,37 @@ from perch_core.isolated import _HEADER
 from perch_core.processes import end_with_parent
 
 OUT_OF_MEMORY = 42
-"""Exit status of a child without enough memory left to report that it ran out of memory."""
+"""Exit status of a child that ran out of memory: what a job has left of it may not suffice for any further one."""
 
 
-def _answer(payload: bytes, memory: int) -> bytes:
-    """Execute a job; return the answer in the format of `isolated._decode_answer`."""
+def _answer(payload: bytes) -> bytes:
+    """Execute a job; return the answer in the format of `isolated._decode_answer`.
+
+    Raises:
+        MemoryError: the process is out of memory, whatever the job has made of that.
+    """
     try:
         function, arguments = pickle.loads(payload)
         result = function(*arguments)
-    except PerchError as error:
-        return b"E" + pickle.dumps(error)
-    except MemoryError:
-        return b"F" + _out_of_memory_text(memory).encode()
     except (Exception, SystemExit) as error:  # the caller must get an answer whatever happens here
+        if _out_of_memory(error):
+            raise MemoryError from error
+        if isinstance(error, PerchError):
+            return b"E" + pickle.dumps(error)
         return b"F" + f"{type(error).__name__}: {error}".encode(errors="replace")
     try:
         return b"A" + pickle.dumps(result)
     except MemoryError:
-        return b"F" + _out_of_memory_text(memory).encode()
+        raise
     except Exception as error:  # what pickle raises depends on what it is given
         return b"F" + f"what it returned cannot be sent: {error}".encode(errors="replace")
 
 
-def _out_of_memory_text(memory: int) -> str:
-    return f"out of memory: the limit of its process is {memory / 2**30:.3g} GiB"
+def _out_of_memory(error: BaseException | None) -> bool:
+    """Return whether an exception, or one that led to it, is of a failed allocation; CasADi's is a RuntimeError."""
+    while error is not None and not isinstance(error, MemoryError) and "std::bad_alloc" not in str(error):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _child(pipe: Connection, supervisor: int, memory: int) -> None:
@@ -54,7 +61,7 @@ def _child(pipe: Connection, supervisor: int, memory: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     while True:
         try:
-            pipe.send_bytes(_answer(pipe.recv_bytes(), memory))
+            pipe.send_bytes(_answer(pipe.recv_bytes()))
         except (EOFError, OSError):
             os._exit(0)
         except MemoryError:
@@ -78,7 +85,7 @@ def _exit_reason(status: int, memory: int) -> str:
         name = signal.Signals(os.WTERMSIG(status)).name
         return f"its process crashed ({name}); the limit of its memory is {memory / 2**30:.3g} GiB"
     if os.WEXITSTATUS(status) == OUT_OF_MEMORY:
-        return _out_of_memory_text(memory)
+        return f"out of memory: the limit of its process is {memory / 2**30:.3g} GiB"
     return f"its process ended itself (exit status {os.WEXITSTATUS(status)})"
 
 

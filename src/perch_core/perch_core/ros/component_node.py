@@ -61,6 +61,7 @@ class ComponentNode(Node):
         self._unwatched: set[Subscription] = set()
         super().__init__(name, **kwargs)
         self.wiring = wiring
+        wiring.on_failure = self.log_refusal
         self._durations: defaultdict[str, deque[float]] = defaultdict(partial(deque, maxlen=DURATIONS_KEPT))
         self._last_logged: dict[str, float] = {}
         self._logged_once: set[str] = set()
@@ -95,6 +96,20 @@ class ComponentNode(Node):
         subscription = self.create_subscription(message, channel, lambda _: None, profile, raw=True)
         self._unwatched.add(subscription)
         return subscription
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any], **kwargs: Any) -> Any:
+        """As in `rclpy.node.Node`; if the callback raises an exception, it is logged, and the response is sent as it is by then.
+
+        Such exceptions are those of rclpy itself, on a parameter of an unknown type. They would end the process.
+        """
+        def respond(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except Exception as error:
+                self.log_refusal(srv_name, error)
+                return response
+
+        return super().create_service(srv_type, srv_name, respond, **kwargs)
 
     def host_time(self) -> int:
         """Return the time of the node's clock, simulation time if `use_sim_time` is set [ns]."""
@@ -221,7 +236,12 @@ class ComponentNode(Node):
 
         def reply(value: Any) -> None:
             nonlocal answered
-            answer(row.answer_message(value))
+            try:
+                message = row.answer_message(value)
+            except Exception as error:  # replies may come later, where nobody else would answer
+                self.log_refusal(row.channel, error)
+                message = self._bad_request(row, f"the answer has no message: {error}")
+            answer(message)
             answered = True
 
         try:
@@ -254,14 +274,23 @@ class ComponentNode(Node):
     # -- parameters --------------------------------------------------------------------------------------------------
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """As in `rclpy.node.Node`; refusals name the parameter and what is allowed."""
+        """As in `rclpy.node.Node`; refusals name the parameter and what is allowed. Whatever the component raises refuses the change."""
         try:
             return super().set_parameters_atomically(self._typed_parameters.checked(parameter_list))
-        except ConfigError as error:
+        except PerchError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            self.log_refusal("parameters", error)
+            return SetParametersResult(successful=False, reason=f"{type(error).__name__}: {error}")
 
     def _reconfigure(self, config: Any) -> None:
-        self.component.reconfigure(config)
+        try:
+            self.component.reconfigure(config)
+        except PerchError:
+            raise
+        except Exception:  # a part of the change may be in effect
+            self.component.reconfigure(self._typed_parameters.value)
+            raise
 
     # -- log and diagnostics -----------------------------------------------------------------------------------------
 

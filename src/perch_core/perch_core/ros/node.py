@@ -122,8 +122,13 @@ class StopSignal:
         return self._set
 
 
-def spin_until_stopped(executor: Executor, stop: StopSignal) -> None:
+def spin_until_stopped(executor: Executor, stop: StopSignal, on_failure: Callable[[str, Exception], None] | None = None) -> None:
     """Run callbacks until the stop signal.
+
+    Args:
+        executor: its first node gets a timer.
+        stop: the signal.
+        on_failure: called with `executor` and an exception that leaves a callback; the executor then continues. None: it is raised.
 
     EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6, and spin_once() restarts for every message, which
     costs 30 us each. Therefore this function waits for a future, 0.1 s at a time. The executor checks this time-out only when no
@@ -137,7 +142,12 @@ def spin_until_stopped(executor: Executor, stop: StopSignal) -> None:
 
     next(iter(executor.get_nodes())).create_timer(CHECK_PERIOD, check_stop, clock=Clock(clock_type=ClockType.STEADY_TIME))
     while not stop and rclpy.ok():
-        executor.spin_until_future_complete(stopped, timeout_sec=CHECK_PERIOD)
+        try:
+            executor.spin_until_future_complete(stopped, timeout_sec=CHECK_PERIOD)
+        except Exception as error:
+            if on_failure is None:
+                raise
+            on_failure("executor", error)
 
 
 def connect(nodes: Sequence[ComponentNode], executor: Any) -> None:
@@ -182,7 +192,7 @@ def run(create: Callable[[Wiring], Sequence[ComponentNode]], args: list[str] | N
             if isinstance(one, ArrivalNode):
                 one.wiring.from_thread(one.request_real_time)  # while it spins: the executor's threads are raised, too
         stop.defer = True
-        spin_until_stopped(executor, stop)
+        spin_until_stopped(executor, stop, nodes[0].log_refusal)
     except (PerchError, rclpy.exceptions.InvalidParameterValueException, rclpy.exceptions.InvalidParameterTypeException) as error:
         _refuse(str(error))
     except RuntimeError as error:

@@ -10,7 +10,6 @@ from dataclasses import Field, is_dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from perch_core import config
-from perch_core.errors import ConfigError
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -85,7 +84,7 @@ class Parameters(typing.Generic[T]):
             node: its name is the source in error messages.
             cls: configuration class (see perch_core.config); nested parts become dotted names.
             changeable: prefixes of the names that may change after the start; the others are read-only.
-            on_change: called with the new value after an accepted `ros2 param set`; it may raise ConfigError to refuse.
+            on_change: called with the new value before it is set; an exception refuses it, and is raised to who sets it.
 
         Raises:
             ConfigError: an override is unknown, of the wrong type or out of range.
@@ -131,12 +130,8 @@ class Parameters(typing.Generic[T]):
         return config.from_mapping(self._cls, config.nested(flat), self._node.get_name())
 
     def _set(self, changes: list[Parameter]) -> SetParametersResult:
-        if not any(change.name in self._leaves for change in changes):
-            return SetParametersResult(successful=True)
-        try:
+        if any(change.name in self._leaves for change in changes):
             value = self._changed(changes)
             self._on_change(value)
-        except ConfigError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        self.value = value
+            self.value = value
         return SetParametersResult(successful=True)

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from typing import Any
 
 from perch_core.component import Client, Component, Unavailable, ports
-from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.wiring import UNNAMED
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 DISCOVERY_TIMEOUT = 5.0  # a request fails after so long without a server; a node that has just started discovers it later [s]
+ANSWER_TIMEOUT = 50.0    # a request fails so long after it was made, which is longer than a plan may take [s]
 CHECK_PERIOD = 0.1       # of the check for servers while a request is open [s]
 WATCH_PERIOD = 1.0       # of the check for new servers [s]
 
@@ -64,10 +64,19 @@ def _watch_servers(node: Node, component: Component[Any], client: Any) -> None:
 
 
 def _client_function(node: Node, row: topics.ServiceRow, client: Any) -> Send:
-    """Return a function that sends a request to every server that appears until one has answered: a server may be restarted."""
+    """Return a function that sends a request to every server that appears until one has answered: a server may be restarted.
+
+    Each request is answered, after `ANSWER_TIMEOUT` at the latest. One that is not the newest is sent to no further server, which
+    would answer it before the newest; it ends with its server.
+    """
+    newest = 0
+
     def send_request(request: Any, take: Callable[[Any], None]) -> None:
-        message, requested, calls = row.request_message(request), set[bytes](), list[Any]()
-        unanswered, last_available = True, time.monotonic()
+        nonlocal newest
+        newest = number = newest + 1
+        requested, calls = set[bytes](), list[Any]()
+        unanswered, problem, begun = True, "", time.monotonic()
+        last_available = begun
 
         def finish(answer: Any) -> None:
             nonlocal unanswered
@@ -79,15 +88,28 @@ def _client_function(node: Node, row: topics.ServiceRow, client: Any) -> Send:
                 take(answer)
 
         def check() -> None:
-            nonlocal last_available
-            if client.service_is_ready():
-                last_available = time.monotonic()
+            nonlocal last_available, problem
+            now = time.monotonic()
+            if now - begun > ANSWER_TIMEOUT:
+                problem = f"{client.srv_name} has not answered within {ANSWER_TIMEOUT:g} s"
+            if problem:
+                node.get_logger().error(f"{problem}: the request is dropped")
+                finish(Unavailable(problem))
+            elif client.service_is_ready():
+                last_available = now
                 servers = _servers(node, client)
-                if not calls or not servers <= requested:
+                if calls and number != newest:
+                    if requested and not requested & servers:
+                        finish(Unavailable(f"{client.srv_name}: the server has ended"))
+                elif not calls or not servers <= requested:
                     requested.update(servers)
-                    calls.append(client.call_async(message))
-                    calls[-1].add_done_callback(lambda done: finish(_answer(row, done)))
-            elif time.monotonic() - last_available > DISCOVERY_TIMEOUT:
+                    try:
+                        calls.append(client.call_async(row.request_message(request)))
+                    except Exception as error:  # of a value that has no message; answered by the timer, as who asks is at work
+                        problem = f"{client.srv_name}: the request cannot be sent: {error}"
+                    else:
+                        calls[-1].add_done_callback(lambda done: finish(_answer(row, done)))
+            elif now - last_available > DISCOVERY_TIMEOUT:
                 finish(Unavailable(f"service {client.srv_name} is not available"))
 
         timer = node.create_timer(CHECK_PERIOD, check, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -98,10 +120,7 @@ def _client_function(node: Node, row: topics.ServiceRow, client: Any) -> Send:
 
 def _answer(row: topics.ServiceRow, future: Any) -> Any:
     """Return the value of a finished call, or `Unavailable`."""
-    response = future.result()
-    if response is None:
-        return Unavailable(f"{row.channel} failed: {future.exception()}")
     try:
-        return row.answer_value(response)
-    except PerchError as error:
+        return row.answer_value(future.result())
+    except Exception as error:  # the request must be answered
         return Unavailable(f"{row.channel} sent an invalid response: {error}")

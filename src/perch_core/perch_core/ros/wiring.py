@@ -36,7 +36,7 @@ class Publication:
             publisher: publisher of the topic.
             to_message: value to message, or to a serialised one.
             always: publish also without subscribers: a latched topic keeps its last message for late subscribers.
-            on_failure: called with the topic and the exception if a value has no message; the value is dropped.
+            on_failure: called with the topic and the exception if a value cannot be published; the value is dropped.
             frequent: as `Topic.frequent`; its message may be delayed if a neighbour takes the value.
             observed: no component in flight waits for it.
         """
@@ -57,11 +57,9 @@ class Publication:
         """Publish a value if `has_subscribers`."""
         if self.has_subscribers():
             try:
-                message = self._to_message(value)
+                self._publisher.publish(self._to_message(value))
             except Exception as error:  # the node continues, and the other values of a bundle are published
                 self._on_failure(self._publisher.topic_name, error)
-            else:
-                self._publisher.publish(message)
 
 
 class Wiring:
@@ -72,6 +70,7 @@ class Wiring:
         hosts_schedule: whether that vehicle is in this process.
         bundled: the process has deadlines and handles events every few milliseconds; messages without urgency leave in bundles.
         progress: notifies that vehicle that something for which it may be waiting has arrived.
+        on_failure: called with a name and an exception that work has raised; the node logs it. By default it is raised again.
     """
 
     def __init__(self) -> None:
@@ -88,6 +87,7 @@ class Wiring:
         self.hosts_schedule = False             # a lockstep's vehicle is in this process
         self.bundled = False
         self.progress: Callable[[], None] = lambda: None
+        self.on_failure: Callable[[str, Exception], None] = _raise
 
     # -- connecting --------------------------------------------------------------------------------------------------
 
@@ -134,7 +134,10 @@ class Wiring:
         try:
             while queue:
                 work, arguments = queue.popleft()
-                work(*arguments)
+                try:
+                    work(*arguments)
+                except Exception as error:  # what follows must not wait for the next event
+                    self.on_failure("event", error)
             if outgoing and (self._urgent or not self.bundled or time.monotonic() - self._last_sent > BUNDLE_PERIOD):
                 while outgoing:
                     publication, value = outgoing.popleft()
@@ -151,7 +154,7 @@ class Wiring:
                 executor.create_task(self.enter, *self._pending.popleft())
 
     def from_thread(self, work: Callable[..., None], *arguments: Any) -> None:
-        """Schedule work on the executor's thread; any thread may call this. Work must not raise: that would end the process."""
+        """Schedule work on the executor's thread; any thread may call this."""
         self._pending.append((work, *arguments))
         if self._executor is not None:  # read after the work is queued: either this call or `run_on` of another thread finds it
             self.run_on(self._executor)
@@ -160,6 +163,10 @@ class Wiring:
 def is_observer(node: str) -> bool:
     """Return whether a node only observes, by its name; one that was discovered before its name may be a vehicle."""
     return node.startswith(OBSERVERS) and node != UNNAMED
+
+
+def _raise(_: str, error: Exception) -> None:
+    raise error
 
 
 def foreign_publishers(node: Node, topic: str, known: set[str]) -> list[str]:

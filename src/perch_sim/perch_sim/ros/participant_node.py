@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from perch_core.component import Action, Component, Input, Service, Unavailable, ports
+from perch_core.component import Action, Component, Input, Service, ports
 from perch_core.errors import PerchError
 from perch_core.ros import topics
 from perch_core.ros.service_clients import Send, connect_clients, server_names
@@ -31,7 +31,6 @@ CONNECT_PERIOD = 0.1   # between attempts to connect to the vehicle [s]
 CHECK_PERIOD = 0.005   # between checks whether an unfinished batch can continue [s]
 REQUEST_PERIOD = 0.5   # between checks of open requests [s]
 POLL_TIMEOUT = 0.01    # wait for a batch before other events are processed [s]
-ANSWER_TIMEOUT = 50.0  # an answer this late was lost with its server: more than a plan may take, less than `lockstep_timeout` [s]
 WARN_AFTER = 3.0       # a vehicle that is missing, or a server that has not answered, for so long is reported [s]
 WARN_REPEAT = 10.0     # between reports of a missing vehicle [s]
 BURST = 40             # batches between which other events are processed
@@ -194,7 +193,7 @@ class ParticipantNode(ComponentNode):
         self._progress()
 
     def _check_requests(self) -> None:
-        """Name servers that do not answer. In the end answer for them with `Unavailable`: the flight must not wait for ever."""
+        """Name servers that do not answer."""
         self._open_requests = [request for request in self._open_requests if not request.answer.done()]
         for request in self._open_requests:
             channel, waited = request.channel, time.monotonic() - request.since
@@ -202,9 +201,6 @@ class ParticipantNode(ComponentNode):
                 request.overdue = f"{channel} from {server_names(self, channel)}"
                 self.get_logger().warning(f"no {request.overdue} for {WARN_AFTER:g} s")
                 self.repeat_diagnostics()
-            if waited > ANSWER_TIMEOUT:
-                self.get_logger().error(f"{channel} has not answered for {ANSWER_TIMEOUT:g} s: the request is dropped")
-                self._take_answer(request.answer, Unavailable(f"{channel} has not answered within {ANSWER_TIMEOUT:g} s"))
 
     def host_diagnostics(self) -> dict[str, Any]:
         """Return the overdue answers, and the servers that owe them."""
