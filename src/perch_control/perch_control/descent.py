@@ -30,6 +30,7 @@ _LEAK = 4.0         # the velocity is forgotten with this time constant [s]
 _BOUNCE_TIME = 0.5  # after a touch the specific force is not evaluated for so long [s]
 _THRUST_SHARE_TOUCHED = 0.4  # thrust / weight after a touch
 _PLAUSIBLE_SPEED = 6.0  # a greater velocity is not used [m/s]
+LONGEST = 60.0          # IMU samples over so long without ground contact: this is no descent [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,13 @@ class AttitudeByImu:
 
 
 class BlindDescent:
-    """Controller of the descent; owns the attitude estimate and detects ground contact."""
+    """Controller of the descent; owns the attitude estimate and detects ground contact.
+
+    Attributes:
+        attitude, v_W: estimated attitude, and velocity in W [m/s].
+        landed: whether the ground carries the vehicle.
+        age: time over which it has taken IMU samples [s]; a jump of the stamps does not count.
+    """
 
     def __init__(self, vehicle: Vehicle, gains: ControlGains, q: tuple[float, ...], w: tuple[float, ...], stamp: float,
                  now: float, v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
@@ -81,13 +88,13 @@ class BlindDescent:
         self._stamp, self._start = stamp, now
         self._rest, self._f_B = Debounce(_REST_TIME), (0.0, 0.0, GRAVITY)
         self._touched: float | None = None  # when the ground was hit [s]
-        self.landed = False
+        self.landed, self.age = False, 0.0
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take one IMU sample: time [s], angular velocity [rad/s] and specific force [m/s^2] in B."""
         dt = min(max(stamp - self._stamp, 0.0), 0.02)
         self.attitude = self.attitude.after(gyro, accel, dt)
-        self._stamp = stamp
+        self._stamp, self.age = stamp, self.age + dt
         b1, b2, b3 = axes_of(self.attitude.q)
         f_W = axpy(accel[0], b1, axpy(accel[1], b2, scale(accel[2], b3)))
         self.v_W = axpy(dt, (f_W[0], f_W[1], f_W[2] - GRAVITY), scale(1.0 - dt / _LEAK, self.v_W))

@@ -10,6 +10,7 @@ from perch_core.values import Command
 from perch_core.vehicle import ControlGains, Vehicle
 from perch_control import actuation
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_start
+from perch_control.descent import LONGEST
 from perch_control.estimator_verdict import EstimatorVerdict
 from perch_control.flight_settings import FlightSettings
 from perch_control.flight_state import FlightState
@@ -291,6 +292,8 @@ class FlightController:
                 x = self._descending(x, self._inputs.refusal or "no odometry")
             elif verdict.jumped:
                 x = hover_after_jump(x, verdict.reason)
+            elif self.supervisor.landing_overdue(x):
+                x = self._descending(x, "the landing has taken too long")
         if x.blind is None:
             x = self._schedule.activated(x)
             if x.flying:
@@ -305,7 +308,7 @@ class FlightController:
         self._schedule.clear()
         x = self._inputs.without_odometry(self.flight_state, stamp)
         if x.flying and self._inputs.imu_age(stamp) > DOWN_TIME:
-            x = motors_off(x, State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s")
+            x = motors_off(x, State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s, motors off")
         return self._finish_step(self._descending(x, "no odometry"))
 
     def _finish_step(self, x: FlightState) -> StepResult:
@@ -316,9 +319,12 @@ class FlightController:
 
     def _actuated(self, x: FlightState) -> tuple[FlightState, StepResult]:
         if x.blind is not None:
-            if not x.blind.landed:
+            if x.blind.landed:
+                x = self._landed(x, "landed without position, motors off")
+            elif x.blind.age > LONGEST:
+                x = motors_off(x, State.FAILED, f"descent without position: no ground contact within {LONGEST:g} s, motors off")
+            else:
                 return actuation.descend(x, x.blind)
-            x = self._landed(x, "landed without position, motors off")
         elif x.flying:
             setpoint = self.supervisor.setpoint(x)
             x, result = actuation.fly(x, setpoint, self.law, self.compensator, self._period.value)
