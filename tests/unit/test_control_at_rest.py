@@ -73,6 +73,17 @@ def test_a_vehicle_that_is_tipped_over_while_armed_is_disarmed(roll_deg, state):
     assert flight.state is state
 
 
+def test_motors_do_not_run_in_the_hands_of_who_carries_the_vehicle():
+    flight, carrying = armed(), (0.6, 0.0, 0.0)
+    carried(flight, (0.0, 0.0, 0.05), v=carrying)
+    assert flight.state is State.DISARMED and "disarmed: the vehicle moves with 0.6 m/s" in flight.said
+    flight.order(Command.ARM)
+    assert flight.state is State.DISARMED and "arm is refused: the vehicle moves with 0.6 m/s" in flight.said
+    carried(flight, (0.0, 0.0, 0.05))
+    flight.order(Command.ARM)
+    assert flight.state is State.ARMED
+
+
 def test_below_the_ground_that_it_was_armed_on_a_vehicle_that_has_left_a_perch_is_in_the_air():
     flight = hovering()
     flight.component.flight.flight_state = flight.component.flight.flight_state._replace(ground=2.6)

@@ -293,6 +293,8 @@ class MissionMachine(ABC):
             # By now it may have taken off: one of the two is refused.
             outputs.commands += [(Command.LAND, "cancelled"), (Command.DISARM, "cancelled")]
             self._end(outputs, Result.CANCELLED, "cancelled on the ground")
+        elif inputs.controller is ControllerState.ATTACHED and self.phase is Phase.ARMING:
+            self._end(outputs, Result.CANCELLED, "cancelled; perched as before")
         else:
             self._too_late = self.committed(inputs.time)
             if self._too_late:
