@@ -55,6 +55,21 @@ def test_a_vehicle_that_lies_below_its_perch_is_not_started():
     assert not flight.motors[-1].armed
 
 
+def test_a_vehicle_that_was_taken_off_its_wall_by_hand_is_not_started():
+    flight = Flight()
+    carried(flight, PERCH, 90.0)
+    flight.order(Command.ATTACHED)
+    carried(flight, (0.3, 0.0, 0.6))
+    flight.order(Command.ARM)
+    assert flight.state is State.ATTACHED and "arm is refused: the vehicle stands upright, off its perch" in flight.said
+    flight.follow(flight.path((0.3, 0.0, 0.6), (0.0, 0.0, 1.2), 1.0))
+    assert "trajectory 5 refused: the vehicle stands upright" in flight.said
+    flight.order(Command.DISARM)
+    carried(flight, (0.3, 0.0, 0.6))
+    flight.order(Command.ARM)
+    assert flight.state is State.ARMED, flight.said
+
+
 @pytest.mark.parametrize("p, v", [(PERCH, (0.0, 0.0, 0.0)), ((2.0, 0.0, 0.6), (0.5, 0.0, 0.0)), ((0.0, 0.0, 0.05), (0.0, 0.0, -3.0))],
                          ids=["where it was", "carried away by the surface", "still falling"])
 def test_a_vehicle_on_its_perch_or_falling_from_it_is_started(p, v):

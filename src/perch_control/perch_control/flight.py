@@ -22,7 +22,7 @@ from perch_control.maneuvers import (
 from perch_control.modes import CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.period import MeasuredPeriod
-from perch_control.resting import check_arming, has_fallen, idling
+from perch_control.resting import TAKEN_DOWN, check_arming, has_fallen, idling, taken_down
 from perch_control.rotor_health import RotorHealth
 from perch_control.schedule import Schedule
 from perch_control.sensor_inputs import SensorInputs
@@ -98,11 +98,6 @@ class FlightController:
         """Name of the control law in use, with `+l1` where it is augmented."""
         return self.law.name + ("+l1" if self.compensator is not None else "")
 
-    @property
-    def trajectory_time(self) -> float:
-        """Time since the start of the running trajectory [s], 0 without one."""
-        return self.flight_state.elapsed if self.flight_state.order is not None else 0.0
-
     # -- orders ------------------------------------------------------------------------------------------------------
 
     def command(self, command: Command, reason: str = "") -> None:
@@ -166,6 +161,8 @@ class FlightController:
             raise TrajectoryRefused("the running manoeuvre is about to be left")
         if has_fallen(x):
             raise TrajectoryRefused("the vehicle has come off and lies below its perch; disarm first")
+        if taken_down(x):
+            raise TrajectoryRefused(TAKEN_DOWN)
         if x.mode is State.ATTACHED:
             x = self.flight_state = self._thrust.reset(x, self.law, self.compensator)
         elif x.mode is State.ARMED and problem:

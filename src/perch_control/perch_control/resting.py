@@ -15,6 +15,8 @@ _IDLE_TIME = 10.0               # armed on the ground without a trajectory for s
 _ARM_TILT = cos(radians(45.0))  # of the largest tilt at which motors start and idle on the ground
 _ARM_SPEED = 0.5                # largest speed there [m/s]
 _ARM_FORCE_MIN = 0.5 * GRAVITY  # smallest specific force along b3 there [m/s^2]
+_STEEP, _UPRIGHT = cos(radians(60.0)), cos(radians(30.0))  # of a perch, and of a vehicle that was taken down from it
+TAKEN_DOWN = "the vehicle stands upright, off its perch; disarm first"
 _FALLEN = 0.5                   # at rest so far below the place of ATTACHED, nothing there carries the vehicle [m]
 _FALLING = 1.0                  # faster than this it is still falling, and the motors may save it [m/s]
 
@@ -41,6 +43,8 @@ def check_arming(x: FlightState, inputs: SensorInputs, specific_thrust: float, t
         raise CommandRefused(f"arm is refused: {problem}")
     if has_fallen(x):
         raise CommandRefused("arm is refused: the vehicle has come off and lies below its perch; disarm first")
+    if taken_down(x):
+        raise CommandRefused(f"arm is refused: {TAKEN_DOWN}")
     if x.mode is State.DISARMED and specific_thrust < _ARM_FORCE_MIN:
         raise CommandRefused(f"arm is refused: the IMU measures {specific_thrust:.1f} m/s^2 along b3 at rest: its axes are configured wrongly")
 
@@ -49,6 +53,12 @@ def has_fallen(x: FlightState) -> bool:
     """Whether an attached vehicle lies below its perch. Only its height counts: the surface may carry it sideways, a wire lets it swing."""
     return (x.mode is State.ATTACHED and x.setpoint().p[2] - x.state_estimate[2] > _FALLEN
             and norm(x.state_estimate[3:6]) < _FALLING)
+
+
+def taken_down(x: FlightState) -> bool:
+    """Whether somebody has taken an attached vehicle off a steep surface or wire: it stands upright, which nothing there holds."""
+    return (x.mode is State.ATTACHED and x.attached_to is not None and x.attached_to[2] < _STEEP
+            and axes_of(x.state_estimate[6:10])[2][2] > _UPRIGHT and norm(x.state_estimate[3:6]) < _ARM_SPEED)
 
 
 def idling(x: FlightState, waiting: bool) -> FlightState:
