@@ -316,12 +316,10 @@ class FlightController:
 
     def _actuated(self, x: FlightState) -> tuple[FlightState, StepResult]:
         if x.blind is not None:
-            if x.blind.landed:
-                x = self._landed(x, "landed without position, motors off")
-            elif x.blind.age > LONGEST:
-                x = motors_off(x, State.FAILED, f"descent without position: no ground contact within {LONGEST:g} s, motors off")
-            else:
+            if not x.blind.landed and x.blind.age <= LONGEST:
                 return actuation.descend(x, x.blind)
+            x = (self._landed(x, "landed without position, motors off") if x.blind.landed else
+                 motors_off(x, State.FAILED, f"descent without position: no ground contact within {LONGEST:g} s, motors off"))
         elif x.flying:
             setpoint = self.supervisor.setpoint(x)
             x, result = actuation.fly(x, setpoint, self.law, self.compensator, self._period.value)
