@@ -66,6 +66,21 @@ def test_a_vehicle_whose_odometry_begins_anew_on_its_perch_departs_once_it_is_ca
     assert flight.state is State.RECOVERING, flight.said
 
 
+def test_a_vehicle_that_was_taken_off_its_wall_by_hand_is_not_started():
+    flight = Flight()
+    carried(flight, PERCH, 90.0)
+    flight.order(Command.ATTACHED)
+    carried(flight, (0.3, 0.0, 0.6))
+    flight.order(Command.ARM)
+    assert flight.state is State.ATTACHED and "arm is refused: the vehicle stands upright, off its perch" in flight.said
+    flight.follow(flight.path((0.3, 0.0, 0.6), (0.0, 0.0, 1.2), 1.0))
+    assert "trajectory 5 refused: the vehicle stands upright" in flight.said
+    flight.order(Command.DISARM)
+    carried(flight, (0.3, 0.0, 0.6))
+    flight.order(Command.ARM)
+    assert flight.state is State.ARMED, flight.said
+
+
 @pytest.mark.parametrize("p, v", [(PERCH, (0.0, 0.0, 0.0)), ((2.0, 0.0, 0.6), (0.5, 0.0, 0.0)), ((0.0, 0.0, 0.05), (0.0, 0.0, -3.0))],
                          ids=["where it was", "carried away by the surface", "still falling"])
 def test_a_vehicle_on_its_perch_or_falling_from_it_is_started(p, v):
@@ -82,6 +97,17 @@ def test_a_vehicle_that_is_tipped_over_while_armed_is_disarmed(roll_deg, state):
     assert flight.state is state and ("tilted by more than 45 deg" in flight.said) is (state is State.DISARMED)
     flight.order(Command.ARM)
     assert flight.state is state
+
+
+def test_motors_do_not_run_in_the_hands_of_who_carries_the_vehicle():
+    flight, carrying = armed(), (0.6, 0.0, 0.0)
+    carried(flight, (0.0, 0.0, 0.05), v=carrying)
+    assert flight.state is State.DISARMED and "disarmed: the vehicle moves with 0.6 m/s" in flight.said
+    flight.order(Command.ARM)
+    assert flight.state is State.DISARMED and "arm is refused: the vehicle moves with 0.6 m/s" in flight.said
+    carried(flight, (0.0, 0.0, 0.05))
+    flight.order(Command.ARM)
+    assert flight.state is State.ARMED
 
 
 def test_below_the_ground_that_it_was_armed_on_a_vehicle_that_has_left_a_perch_is_in_the_air():

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from closed_loop.plant import Disturbances
+from perch_control import supervisor
 from perch_control.descent import BlindDescent
 from perch_control.flight_settings import FlightSettings
 from perch_control.modes import State
+from perch_core.values import Command
 from perch_core.vehicle import ControlGains, load_vehicle
 from unit.controller_flight import Flight, hovering, parameters
 
@@ -55,3 +57,30 @@ def test_what_was_felt_before_the_descent_is_no_rest():
     for k in range(500, 820):
         x.imu(0.002 * k, ZERO, (0.0, 0.0, 9.81))
     assert x.landed, "rest after the descent has begun is the ground"
+
+
+def test_a_landing_that_odometry_does_not_show_is_ended_by_the_imu(monkeypatch):
+    flight, climbing = hovering(), (0.0, 0.0, 0.3)
+    flight.order(Command.LAND)
+    flight.step(5.0, v_B=climbing)
+    assert flight.state is State.LANDING and flight.plant.p[2] < 0.02, "at rest on the ground, and odometry says that it climbs"
+    monkeypatch.setattr(supervisor.Supervisor, "longest_landing", 1.4)
+    lands(flight, v_B=climbing)
+    assert "descent without position: the landing has taken too long" in flight.said and "landed without position" in flight.said
+
+
+def test_a_descent_that_never_meets_the_ground_stops_the_motors(monkeypatch):
+    monkeypatch.setattr(supervisor.Supervisor, "longest_landing", 1.0)
+    flight = hovering()
+    felt = flight.imu
+    flight.imu = lambda: felt()._replace(w_B=ZERO, f_B=(0.0, 0.0, 8.9))
+    flight.step(0.9, odometry=False)
+    assert flight.state is State.LANDING and flight.motors[-1].armed
+    flight.step(0.4, odometry=False)
+    assert flight.state is State.FAILED and not flight.motors[-1].armed and "no ground contact within 1 s, motors off" in flight.said
+
+
+def test_a_jump_of_the_stamps_does_not_age_a_descent():
+    x = BlindDescent(load_vehicle("snapdragon"), ControlGains(), LEVEL, ZERO, 0.0, 0.0)
+    x.imu(1000.0, ZERO, (0.0, 0.0, 9.1))
+    assert x.age < 0.1

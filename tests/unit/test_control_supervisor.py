@@ -16,6 +16,7 @@ from perch_control.odometry_gate import OdometryGate
 from perch_control.sensor_inputs import SensorInputs
 from perch_control.reference import FlatReference, SampledReference
 from perch_core import so3
+from perch_core.errors import ConfigError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory, rest_to_rest
 from perch_core.values import Command
 
@@ -317,6 +318,11 @@ def test_each_fault_leads_to_its_answer(fault, expected, word, monkeypatch):
     reached = loop.controller.state is expected and word in flight.flight_state.message
     reached = reached or loop.run(3.0, until=lambda x: x.controller.state is expected and word in flight.flight_state.message)
     assert reached, (loop.controller.state, flight.flight_state.message, loop.events)
+
+
+def test_a_geofence_without_an_inside_is_refused():
+    with pytest.raises(ConfigError, match="fence_low.*is not below fence_high"):
+        FlightSettings(fence_low=(-20.0, -20.0, 20.0))
 
 
 @pytest.mark.parametrize("tilt", [70.0, 135.0, 180.0])

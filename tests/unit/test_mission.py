@@ -362,6 +362,14 @@ def test_cancel_works_in_every_phase(phase):
         ControllerState.DISARMED if on_ground else ControllerState.ATTACHED if attached else ControllerState.HOVERING)
 
 
+def test_a_cancel_on_the_perch_of_an_earlier_goal_changes_nothing():
+    world = World()
+    world.controller = ControllerState.ATTACHED
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    world.tick(cancel=True)
+    assert world.outcome.result is Result.CANCELLED and world.outcome.message == "cancelled; perched as before" and not world.commands
+
+
 def test_a_vehicle_that_comes_off_after_a_cancel_is_started_all_the_same():
     world = World(stays=False)
     world.run(cancel_in=Phase.PERCHED)

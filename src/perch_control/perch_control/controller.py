@@ -329,7 +329,7 @@ class Controller(Component[ControllerParameters]):
         flight, x = self.flight, self.flight.flight_state
         self.status(ControllerStatus(
             stamp=stamp, state=int(flight.state), controller=flight.law_name, trajectory_id=x.trajectory_id,
-            trajectory_time=float(flight.trajectory_time), trajectory_duration=float(x.order.source.duration) if x.order else 0.0,
+            trajectory_time=float(x.elapsed) if x.order else 0.0, trajectory_duration=float(x.order.source.duration) if x.order else 0.0,
             position_error=float(x.position_error), odometry_age=float(min(flight.odometry_age, 1e6)),
             thrust_margin=float(x.margin), thrust_ratio=float(flight.thrust_ratio), message=x.message))
 

@@ -62,7 +62,13 @@ class AttitudeByImu:
 
 
 class BlindDescent:
-    """Controller of the descent; owns the attitude estimate and detects ground contact."""
+    """Controller of the descent; owns the attitude estimate and detects ground contact.
+
+    Attributes:
+        attitude, v_W: estimated attitude, and velocity in W [m/s].
+        landed: whether the ground carries the vehicle.
+        age: time over which it has taken IMU samples [s]; a jump of the stamps does not count.
+    """
 
     def __init__(self, vehicle: Vehicle, gains: ControlGains, q: tuple[float, ...], w: tuple[float, ...], stamp: float,
                  now: float, v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
@@ -81,13 +87,13 @@ class BlindDescent:
         self._stamp, self._start = stamp, now
         self._rest, self._f_B = Debounce(_REST_TIME), (0.0, 0.0, GRAVITY)
         self._touched: float | None = None  # when the ground was hit [s]
-        self.landed = False
+        self.landed, self.age = False, 0.0
 
     def imu(self, stamp: float, gyro: tuple[float, ...], accel: tuple[float, ...]) -> None:
         """Take one IMU sample: time [s], angular velocity [rad/s] and specific force [m/s^2] in B."""
         dt = min(max(stamp - self._stamp, 0.0), 0.02)
         self.attitude = self.attitude.after(gyro, accel, dt)
-        self._stamp = stamp
+        self._stamp, self.age = stamp, self.age + dt
         b1, b2, b3 = axes_of(self.attitude.q)
         f_W = axpy(accel[0], b1, axpy(accel[1], b2, scale(accel[2], b3)))
         self.v_W = axpy(dt, (f_W[0], f_W[1], f_W[2] - GRAVITY), scale(1.0 - dt / _LEAK, self.v_W))

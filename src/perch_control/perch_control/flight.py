@@ -21,7 +21,7 @@ from perch_control.maneuvers import (
 from perch_control.modes import CommandRefused, State, StepResult
 from perch_control.monitors import DOWN_TIME
 from perch_control.period import MeasuredPeriod
-from perch_control.resting import FALLEN, check_arming, has_fallen, idling
+from perch_control.resting import check_arming, idling, off_perch
 from perch_control.rotor_health import RotorHealth
 from perch_control.schedule import Schedule
 from perch_control.sensor_inputs import SensorInputs
@@ -97,11 +97,6 @@ class FlightController:
         """Name of the control law in use, with `+l1` where it is augmented."""
         return self.law.name + ("+l1" if self.compensator is not None else "")
 
-    @property
-    def trajectory_time(self) -> float:
-        """Time since the start of the running trajectory [s], 0 without one."""
-        return self.flight_state.elapsed if self.flight_state.order is not None else 0.0
-
     # -- orders ------------------------------------------------------------------------------------------------------
 
     def command(self, command: Command, reason: str = "") -> None:
@@ -163,8 +158,8 @@ class FlightController:
             raise TrajectoryRefused("no usable odometry")
         if self._schedule.leaving(x) or x.land_requested:
             raise TrajectoryRefused("the running manoeuvre is about to be left")
-        if has_fallen(x):
-            raise TrajectoryRefused(FALLEN)
+        if off := off_perch(x):
+            raise TrajectoryRefused(off)
         if x.mode is State.ATTACHED:
             x = self.flight_state = self._thrust.reset(x, self.law, self.compensator)
         elif x.mode is State.ARMED and problem:
@@ -291,6 +286,8 @@ class FlightController:
                 x = self._descending(x, self._inputs.refusal or "no odometry")
             elif verdict.jumped:
                 x = hover_after_jump(x, verdict.reason)
+            elif x.mode is State.LANDING and x.elapsed > self.supervisor.longest_landing:
+                x = self._descending(x, "the landing has taken too long")
         if x.blind is None:
             x = self._schedule.activated(x)
             if x.flying:
@@ -305,7 +302,7 @@ class FlightController:
         self._schedule.clear()
         x = self._inputs.without_odometry(self.flight_state, stamp)
         if x.flying and self._inputs.imu_age(stamp) > DOWN_TIME:
-            x = motors_off(x, State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s")
+            x = motors_off(x, State.FAILED, f"neither odometry nor IMU for {DOWN_TIME:g} s, motors off")
         return self._finish_step(self._descending(x, "no odometry"))
 
     def _finish_step(self, x: FlightState) -> StepResult:
@@ -316,9 +313,10 @@ class FlightController:
 
     def _actuated(self, x: FlightState) -> tuple[FlightState, StepResult]:
         if x.blind is not None:
-            if not x.blind.landed:
+            if not x.blind.landed and x.blind.age <= self.supervisor.longest_landing:
                 return actuation.descend(x, x.blind)
-            x = self._landed(x, "landed without position, motors off")
+            x = (self._landed(x, "landed without position, motors off") if x.blind.landed else
+                 motors_off(x, State.FAILED, f"descent without position: no ground contact within {self.supervisor.longest_landing:.0f} s, motors off"))
         elif x.flying:
             setpoint = self.supervisor.setpoint(x)
             x, result = actuation.fly(x, setpoint, self.law, self.compensator, self._period.value)

@@ -24,6 +24,7 @@ _MISSED_SPEED = 1.0  # faster than this after the planned contact: it was missed
 _GROUND_GAP = 0.12   # the descending reference is so far below the vehicle ... [m]
 _GROUND_SPEED = 0.1  # ... not moving faster than this up or down ... [m/s]
 _GROUND_TIME = 0.25  # ... for so long: on the ground [s]
+_LANDING_TIME = 30.0  # a landing takes no longer than through the whole geofence, and this [s]
 _UPRIGHT = 0.7       # cosine of the tilt beyond which a recovery or a perch goes on before a landing on weak rotors begins
 
 
@@ -68,7 +69,7 @@ class Supervisor:
             self._tilted_contact = TiltedContactMonitor()
         self._tilted_contact.imu(stamp, gyro, accel)
         if self._tilted_contact.confirmed:
-            return motors_off(x, State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle")
+            return motors_off(x, State.FAILED, "at rest and tilted with the motors running: something else carries the vehicle; motors off")
         return x
 
     @property
@@ -164,6 +165,12 @@ class Supervisor:
             height, climb = x.state_estimate[2], x.state_estimate[5]
             resting = abs(climb) < min(_GROUND_SPEED, 0.5 * self.settings.land_speed) and height - setpoint.p[2] > _GROUND_GAP
         return self._ground.update(resting, x.now)
+
+    @property
+    def longest_landing(self) -> float:
+        """Time after which a landing, or a descent without position, has not detected its ground contact [s]."""
+        s = self.settings
+        return (s.fence_high[2] - s.fence_low[2]) / s.land_speed + _LANDING_TIME
 
 
 MONITORS: dict[State, Callable[[Supervisor, FlightState], FlightState]] = {

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from perch_core.jit import compiled
+from perch_core.vehicle import GRAVITY
 from perch_sim.body import PLATE_POINTS, Body
 from perch_sim.obstacles import Surfaces
 
-GRAVITY = 9.81
 STATES = 13
 SLIDING_SPEED = 0.02   # below it friction fades out, so that a resting vehicle stays quiet [m/s]
 EFFECT_HEIGHT = 0.5    # ground effect is evaluated no nearer than this many rotor radii

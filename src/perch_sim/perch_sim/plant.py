@@ -9,13 +9,13 @@ import numpy as np
 
 from perch_core.errors import ConfigError, PerchError
 from perch_core.values import Contact
-from perch_core.vehicle import Vehicle, vehicle_file
+from perch_core.vehicle import GRAVITY, Vehicle, vehicle_file
 from perch_sim import seeding
 from perch_sim.attachment import FREE
 from perch_sim.body import PLATE_POINTS, Body, hold_rate, make_body
 from perch_sim.cable_contact import CableMonitor
 from perch_sim.contact import ContactMonitor
-from perch_sim.dynamics import GRAVITY, STATES, Hold, advance_to_touch, clearances
+from perch_sim.dynamics import STATES, Hold, advance_to_touch, clearances
 from perch_sim.obstacles import make_obstacles
 from perch_sim.scenario import Scenario
 from perch_sim.state_history import TrueState

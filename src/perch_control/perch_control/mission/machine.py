@@ -18,7 +18,6 @@ from perch_control.mission.values import Command, ControllerState, Goal, Inputs,
 SEARCH_RISE = 0.25              # height change of the search pattern [m]
 SEARCH_TURN = np.radians(30.0)  # its sweep [rad]
 ACCEPTANCE_TIMEOUT = 0.5  # a controller that still hovers so long after a trajectory's start has not accepted it [s]
-_FLYING = (ControllerState.TRACKING, ControllerState.HOVERING)
 
 
 class MissionMachine(ABC):
@@ -146,7 +145,7 @@ class MissionMachine(ABC):
     def _arming(self, inputs: Inputs, outputs: Outputs) -> None:
         if inputs.controller is ControllerState.ATTACHED:
             self._end(outputs, Result.PERCHED_ALREADY, "the vehicle is perched; call the service `depart` first")
-        elif inputs.controller in _FLYING and inputs.estimator_ready:
+        elif inputs.controller in (ControllerState.TRACKING, ControllerState.HOVERING) and inputs.estimator_ready:
             self._go_to_search(inputs, outputs, "already flying: going to the search place")
         elif inputs.controller is ControllerState.ARMED and inputs.controller_time > self.since and inputs.estimator_ready:
             self._go_to_search(inputs, outputs, "taking off", on_ground=True)
@@ -293,6 +292,8 @@ class MissionMachine(ABC):
             # By now it may have taken off: one of the two is refused.
             outputs.commands += [(Command.LAND, "cancelled"), (Command.DISARM, "cancelled")]
             self._end(outputs, Result.CANCELLED, "cancelled on the ground")
+        elif inputs.controller is ControllerState.ATTACHED and self.phase is Phase.ARMING:
+            self._end(outputs, Result.CANCELLED, "cancelled; perched as before")
         else:
             self._too_late = self.committed(inputs.time)
             if self._too_late:

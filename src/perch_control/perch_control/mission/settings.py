@@ -37,7 +37,7 @@ class MissionSettings:
     replan_shift: ClassVar[float] = 0.3  # a new plan whose contact is earlier or later by more is not flown [s]
     mapping_approach: float = quantity(2.8, unit="m", low=0.0, high=10.0, doc="approach towards the lines, to map them better")
     mapping_standoff: float = quantity(2.2, unit="m", above=0.0, high=50.0, doc="least distance to the target in that approach")
-    plan_lead: float = quantity(0.1, unit="s", low=0.01, high=5.0, doc="a plan starts this long after its request, at least the latency")
+    plan_lead: float = quantity(0.1, unit="s", low=0.01, high=5.0, doc="a plan starts this long after its request, or 0.04 s after its use where that is later")
     replan_period: ClassVar[float] = 0.1  # [s]
     replan_until: ClassVar[float] = 0.4  # no new plan closer than this to the contact [s]
     contact_time: float = quantity(0.25, unit="s", low=0.0, high=2.0, doc="how long adhesion is awaited after the planned contact")

@@ -30,7 +30,7 @@ SENSOR = Qos(_profile(200), _profile(200, reliable=False))        # imu, odometr
 IMAGE = Qos(_profile(5), _profile(5, reliable=False))             # images, camera_info
 STATE = Qos(_profile(50), _profile(50))                           # statuses, results of perception
 ORDER = Qos(_profile(50), _profile(50))                           # trajectories
-COMMAND = Qos(_profile(50), QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=0))  # commands: no later one displaces a KILL that waits
+COMMAND = Qos(_profile(500), QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=0))  # commands: no later one displaces a KILL that waits
 LATCHED = Qos(_profile(1, latched=True), _profile(1, latched=True))         # facts, the newest map
 EVENT = Qos(_profile(100, latched=True), _profile(100, latched=True))       # contacts: all of them, also for late subscribers
 STATIC = Qos(_profile(50, latched=True), _profile(50, latched=True))        # /tf_static

@@ -33,7 +33,7 @@ class PerchGoal:
 
 
 class PerchFeedback(NamedTuple):
-    """Progress of a goal: phase, share of the phase, predicted time to contact [s] (NaN: not on the way), message."""
+    """Progress of a goal: phase, share of the mission that is done, predicted time to contact [s] (NaN: not on the way), message."""
 
     phase: str
     progress: float

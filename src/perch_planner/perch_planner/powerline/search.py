@@ -138,10 +138,12 @@ class Search:
             (np.inf, *formulation.accuracy[1:]), leaving=margins.leaving, radius_reduction=reduction)
 
     def _end_margins(self, start: np.ndarray, lines: tuple[Segment, ...], end_height: float = np.inf) -> tuple[Margins, float]:
-        """Margins that a start and the height of an end [m] permit, and the reduction of the wires' radii [m] that frees the start.
+        """Margins that the ends of a manoeuvre permit, and the reduction of the wires' radii [m] with which its start is clear of them.
+
+        The margin of height is at most half of what the lower end is above height_min, that of clearance at most half of the start's.
 
         Raises:
-            PlanningRefusal: the body cuts a wire even with the reduced radius.
+            PlanningRefusal: at the start the body cuts a wire, even one of reduced radius.
         """
         margins, clearance = self.settings.margins, np.inf
         height = min(margins.height, max(0.0, 0.5 * (min(start[2], end_height) - self.settings.height_min)))
@@ -151,7 +153,8 @@ class Search:
             if clearance > 0:
                 return replace(margins, height=height, clearance=min(margins.clearance, 0.5 * _clearance_margin(clearance))), reduction
         raise PlanningRefusal("start_invalid", "clearance [P:eq14j]", clearance,
-                              f"no recovery: the body cuts a line, scaled distance {1 + clearance:.2f} < 1")
+                              f"no recovery: at the start the body cuts a line, even with its radius reduced by {RADIUS_REDUCTION:g} m: "
+                              f"scaled distance {1 + clearance:.2f} < 1")
 
     def _clearance(self, state: np.ndarray, lines: Sequence[Segment]) -> float:
         """Scaled distance of the nearest line from the body, less 1, at a state; inf without lines."""
