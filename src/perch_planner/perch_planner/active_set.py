@@ -50,10 +50,10 @@ def _split(Q: Array, k: int, row: Array, y: Array, z: Array, part: Array, remove
         y[i] = 0.0
     for i in range(len(z)):
         z[i] = row[i]
-    length, before = np.sqrt(np.dot(z, z)), np.inf
+    length: float = np.sqrt(np.dot(z, z))
     if k == 0:
         return length
-    active, share = Q[:k], part[:k]
+    active, share, before = Q[:k], part[:k], np.inf
     while _DEPENDENT < length < _REPEAT_BELOW * before:
         before = length
         np.dot(active, z, share)
