@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from perch_core import bernstein
+from perch_core import bernstein, jit
 from perch_core.flatness import flat_to_state
 from perch_core.surface import PerchSurface
 from perch_core.vehicle import load_vehicle
@@ -119,6 +119,29 @@ def test_a_program_that_starts_at_the_multipliers_of_another_has_the_same_minimu
             assert np.array_equal(np.sign(again.dual), np.sign(cold.dual)) and cold.dual.any()
             solvable += 1
     assert 20 < solvable < 50, "both kinds are met"
+
+
+def test_the_steps_of_a_program_allocate_no_arrays():
+    """An array for each step takes more time than its arithmetic: arrays are allocated for each look at all rows, of which there are few."""
+    if not jit.COMPILED:
+        pytest.skip("without numba there is no count of allocations")
+    from numba.core.runtime import _nrt_python, rtsys
+
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(120, 60))
+    rows /= np.linalg.norm(rows, axis=1)[:, None]
+    values = rows @ rng.normal(size=60)
+    lower, upper = values - 0.01, values + 0.01 + np.arange(120) % 3
+    least_norm(rows, lower, upper)
+    _nrt_python.memsys_enable_stats()
+    try:
+        begin = rtsys.get_allocation_stats().alloc
+        answer = least_norm(rows, lower, upper)
+        allocated = rtsys.get_allocation_stats().alloc - begin
+    finally:
+        _nrt_python.memsys_disable_stats()
+    assert answer.solved and np.count_nonzero(answer.dual) > 50, "many steps are taken"
+    assert 0 < allocated < 200
 
 
 def test_multipliers_follow_the_keys_of_their_rows():

@@ -44,22 +44,31 @@ class Solution(NamedTuple):
 
 
 @compiled
-def _remainder(Q: Array, row: Array) -> tuple[Array, Array, float]:
-    """Split a row into y Q and a remainder z orthogonal to the rows of Q: (y, z, |z|)."""
-    y, z = np.zeros(len(Q)), row.copy()
-    length, before = np.sqrt(np.dot(z, z)), np.inf
-    while len(Q) > 0 and _DEPENDENT < length < _REPEAT_BELOW * before:
+def _split(Q: Array, k: int, row: Array, y: Array, z: Array, part: Array, removed: Array) -> float:
+    """Split a row into y Q and a remainder z orthogonal to the first k rows of Q, and return |z|; part, removed: work arrays like y, z."""
+    for i in range(k):
+        y[i] = 0.0
+    for i in range(len(z)):
+        z[i] = row[i]
+    length: float = np.sqrt(np.dot(z, z))
+    if k == 0:
+        return length
+    active, share, before = Q[:k], part[:k], np.inf
+    while _DEPENDENT < length < _REPEAT_BELOW * before:
         before = length
-        part = np.dot(Q, z)
-        z -= np.dot(part, Q)
-        y += part
+        np.dot(active, z, share)
+        np.dot(share, active, removed)
+        for i in range(len(z)):
+            z[i] -= removed[i]
+        for i in range(k):
+            y[i] += share[i]
         length = np.sqrt(np.dot(z, z))
-    return y, z, length
+    return length
 
 
 @compiled
 def _append(Q: Array, L: Array, k: int, y: Array, z: Array, length: float) -> None:
-    """Append a row split by `_remainder` to the k active ones."""
+    """Append a row split by `_split` to the k active ones."""
     for i in range(k):
         L[k, i] = y[i]
     L[k, k] = length
@@ -83,33 +92,32 @@ def _remove(Q: Array, L: Array, k: int, q: int) -> None:
 
 
 @compiled
-def _transposed_solution(L: Array, y: Array) -> Array:
-    """Solution r of L' r = y."""
-    r = y.copy()
-    for j in range(len(y) - 1, -1, -1):
+def _solve_transposed(L: Array, k: int, r: Array) -> None:
+    """Overwrite y, the first k entries of `r`, by the solution r of L' r = y."""
+    for j in range(k - 1, -1, -1):
         r[j] /= L[j, j]
         for i in range(j):
             r[i] -= L[j, i] * r[j]
-    return r
 
 
 @compiled
-def _optimum(Q: Array, L: Array, at: Array, multipliers: Array) -> Array:
-    """Shortest w with the active rows at their bounds; their multipliers are written to `multipliers`."""
-    c = at.copy()
-    for i in range(len(c)):
+def _optimum(Q: Array, L: Array, k: int, at: Array, multipliers: Array) -> Array:
+    """Shortest w with the k active rows at their bounds; their multipliers are written to `multipliers`."""
+    c = at[:k].copy()
+    for i in range(k):
         for j in range(i):
             c[i] -= L[i, j] * c[j]
         c[i] /= L[i, i]
-    multipliers[:] = _transposed_solution(L, c)
-    return np.dot(c, Q) if len(c) else np.zeros(Q.shape[1])
+        multipliers[i] = c[i]
+    _solve_transposed(L, k, multipliers)
+    return np.dot(c, Q[:k]) if k else np.zeros(Q.shape[1])
 
 
 @compiled
-def _first_zero(multipliers: Array, sign: Array, rate: Array) -> tuple[float, int]:
-    """Step after which the first multiplier has fallen to zero at rate `sign * rate`, and which one: (step, index)."""
+def _first_zero(k: int, multipliers: Array, sign: Array, rate: Array) -> tuple[float, int]:
+    """Step after which the first of k multipliers has fallen to zero at rate `sign * rate`, and which one: (step, index)."""
     least, blocking = np.inf, -1
-    for j in range(len(rate)):
+    for j in range(k):
         fall = sign[j] * rate[j]
         if fall > 0.0 and max(sign[j] * multipliers[j], 0.0) < least * fall:
             least, blocking = max(sign[j] * multipliers[j], 0.0) / fall, j
@@ -126,8 +134,8 @@ def _drop(Q: Array, L: Array, k: int, q: int, active: Indices, at: Array, sign: 
 
 
 @compiled
-def _most_violated(rows: Array, lower: Array, upper: Array, w: Array, violated: Indices, beyond: Array) -> tuple[int, float]:
-    """Row that w violates about most among those of `violated`, and by how much; -1 where all of them hold.
+def _most_violated(rows: Array, lower: Array, upper: Array, w: Array, violated: Indices, beyond: Array) -> tuple[int, float, float]:
+    """Row that w violates about most among those of `violated`, its side, 1 at the lower bound, and by how much; -1 where all hold.
 
     Args:
         beyond: violations at an earlier w, shape (r,). Those of the rows that are looked at become that of w, of the chosen one zero: most
@@ -139,12 +147,12 @@ def _most_violated(rows: Array, lower: Array, upper: Array, w: Array, violated: 
             if beyond[q] > earlier:
                 p, earlier = q, beyond[q]
         if p < 0:
-            return -1, 0.0
+            return -1, 0.0, 0.0
         value = np.dot(rows[p], w)
         excess = max(lower[p] - value, value - upper[p])
         if excess >= 0.5 * earlier:
             beyond[p] = 0.0
-            return p, excess
+            return p, 1.0 if value < lower[p] else -1.0, excess
         beyond[p] = excess
 
 
@@ -164,23 +172,24 @@ def shortest(rows: Array, lower: Array, upper: Array, start: Array) -> tuple[Arr
     most = min(count, n)
     Q, L, is_active, dual = np.empty((most, n)), np.empty((most, most)), np.zeros(count, np.bool_), np.zeros(count)
     active, at, sign, multipliers = np.empty(most, np.int64), np.empty(most), np.empty(most), np.zeros(most)
+    y, z, rate, part, removed = np.empty(most), np.empty(n), np.empty(most), np.empty(most), np.empty(n)
     k = 0
     for p in range(count):
         bound = lower[p] if start[p] > 0.0 else upper[p]
         if start[p] != 0.0 and k < most and np.isfinite(bound):
-            y, z, length = _remainder(Q[:k], rows[p])
+            length = _split(Q, k, rows[p], y, z, part, removed)
             if length > _DEPENDENT:
                 _append(Q, L, k, y, z, length)
                 active[k], at[k], sign[k], is_active[p] = p, bound, np.sign(start[p]), True
                 k += 1
-    w = _optimum(Q[:k], L, at[:k], multipliers[:k])
+    w = _optimum(Q, L, k, at, multipliers)
     while k > 0:
         q = int((sign[:k] * multipliers[:k]).argmin())
         if sign[q] * multipliers[q] >= 0.0:
             break
         _drop(Q, L, k, q, active, at, sign, multipliers, is_active)
         k -= 1
-        w = _optimum(Q[:k], L, at[:k], multipliers[:k])
+        w = _optimum(Q, L, k, at, multipliers)
     steps, steps_max = 0, _STEPS_FACTOR * (count + n)
     while True:
         value, steps = np.dot(rows, w), steps + 1
@@ -191,14 +200,16 @@ def shortest(rows: Array, lower: Array, upper: Array, start: Array) -> tuple[Arr
                 dual[active[j]] = multipliers[j]
             return w, dual, len(violated) == 0 and (count == 0 or beyond.max() <= FEASIBILITY)
         while True:
-            p, excess = _most_violated(rows, lower, upper, w, violated, beyond)
+            p, side, excess = _most_violated(rows, lower, upper, w, violated, beyond)
             if p < 0:
                 break
-            side, new = 1.0 if np.dot(rows[p], w) < lower[p] else -1.0, 0.0
+            new = 0.0
             while not is_active[p]:
-                y, z, length = _remainder(Q[:k], rows[p])
-                rate = _transposed_solution(L, side * y)
-                to_drop, blocking = _first_zero(multipliers[:k], sign[:k], rate)
+                length = _split(Q, k, rows[p], y, z, part, removed)
+                for j in range(k):
+                    rate[j] = side * y[j]
+                _solve_transposed(L, k, rate)
+                to_drop, blocking = _first_zero(k, multipliers, sign, rate)
                 to_bound = excess / length**2 if length > _DEPENDENT else np.inf
                 step, steps = min(to_drop, to_bound), steps + 1
                 if blocking < 0 and not to_bound < np.inf or steps > steps_max:
@@ -207,7 +218,8 @@ def shortest(rows: Array, lower: Array, upper: Array, start: Array) -> tuple[Arr
                     multipliers[j] -= step * rate[j]
                 new += step
                 if length > _DEPENDENT:
-                    w += side * step * z
+                    for i in range(n):
+                        w[i] += side * step * z[i]
                     excess -= step * length**2
                 if to_bound <= to_drop:
                     _append(Q, L, k, y, z, length)
@@ -218,7 +230,7 @@ def shortest(rows: Array, lower: Array, upper: Array, start: Array) -> tuple[Arr
                     k -= 1
             if np.dot(w, w) > _NORM_MAX**2:
                 return w, dual, False
-        w = _optimum(Q[:k], L, at[:k], multipliers[:k])
+        w = _optimum(Q, L, k, at, multipliers)
 
 
 def least_norm(rows: Array, lower: Array, upper: Array, dual: Array | None = None) -> Solution:

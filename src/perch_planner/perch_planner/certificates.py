@@ -28,8 +28,9 @@ def certificates(results: np.ndarray, limits: Limits, mass: float) -> tuple[Cert
     table = (("N", *limits.thrust, mass, "bernstein"), ("m/s", -inf, limits.speed, 1.0, "bernstein"),
              ("m", *limits.height, 1.0, "bernstein"), ("m", limits.clearance, inf, 1.0, "bernstein"),
              ("rad/s", -inf, limits.body_rate, 1.0, "bernstein"), ("N", *limits.rotor_thrust, 1.0, "interval"))
-    out, others_hold = [], bool(results[:plan_checks.ROTOR_THRUST, plan_checks.HOLDS].all())  # else the rotors are not proved
-    for quantity, row, (unit, low, high, scale, method) in zip(plan_checks.NAMES, results.tolist(), table):
+    rows, out = results.tolist(), []
+    others_hold = all(row[plan_checks.HOLDS] for row in rows[:plan_checks.ROTOR_THRUST])  # else the rotors are not proved
+    for quantity, row, (unit, low, high, scale, method) in zip(plan_checks.NAMES, rows, table):
         minimum, at_minimum, maximum, at_maximum, holds = row
         if not holds and quantity in _SAMPLED or quantity == "rotor_thrust" and not others_hold:
             method = "dense"

@@ -62,7 +62,7 @@ def _prefer_stretch(extrema: Array, high: float, waypoints: int) -> bool:
 
 @compiled
 def check_plan(coefficients: Array, yaw: Array, heading: Array, durations: Array, plan_limits: tuple[Any, ...], rotors: Rotors, allow_stretch: bool,
-               after_first: bool) -> tuple[Array, Array, tuple[float, float, bool, bool, bool, bool], BoundArrays, BoundArrays, Array]:
+               after_first: bool) -> tuple[Array, Array, tuple[float, float, bool, bool, bool, bool], BoundArrays, BoundArrays, Array, Array]:
     """Check a plan, and find cuts against violated limits.
 
     Args:
@@ -76,12 +76,12 @@ def check_plan(coefficients: Array, yaw: Array, heading: Array, durations: Array
         after_first: this is not the first program: the other limits are also checked where the thrust is nearly in its range.
 
     Returns:
-        (extrema, results, (thrust_min, thrust_max, checked, rotors_hold, holds, stretch), thrust, other, thrusts). extrema: from
+        (extrema, results, (thrust_min, thrust_max, checked, rotors_hold, holds, stretch), thrust, other, motions, thrusts). extrema: from
         `plan_checks.thrust_extrema`; results: rows of `plan_checks.NAMES`, meaningless unless `checked`; thrust_min, thrust_max: proved extrema of
         the specific thrust [m/s^2]; checked: the limits other than the thrust were checked; rotors_hold: no violation of the rotor range was
         found, and its proof did not fail; holds: all limits but the rotor range are proved, and with `rotors_hold` that, too; stretch: longer
         durations promise more than cuts, and none were made; thrust, other: cuts of the thrust and of the other limits, fields of `Bounds`;
-        thrusts: from `rotor_thrusts.sample_rotor_thrusts`, empty where the rotors were not checked.
+        motions, thrusts: from `rotor_thrusts.sample_rotor_thrusts`, empty where the rotors were not checked.
     """
     p_S, v_S, s3, turn_direction, low, high, speed, low_height, high_height, extension, clearance, offset, rate, small_violation, waypoints = plan_limits
     extrema, least, most, forces, squares = thrust_extrema(coefficients, durations, low, high)
@@ -92,10 +92,10 @@ def check_plan(coefficients: Array, yaw: Array, heading: Array, durations: Array
     if checked:
         results[:5], where, holds = check(coefficients, yaw, durations, extrema, forces, squares, p_S, v_S, s3, low, high, speed,
                                           low_height, high_height, extension, clearance, offset, rate)
-    thrusts = np.empty((0, 4, 0))
+    motions, thrusts = np.empty((0, 9, 0)), np.empty((0, 4, 0))
     if checked or not (after_first or stretch or least < _ROTOR_CHECK_SHARE * low):
         low_rotor, high_rotor, mass, J, mixing = rotors
-        thrusts, row = sample_rotor_thrusts(coefficients, heading, durations, mass, J, mixing)
+        motions, thrusts, row = sample_rotor_thrusts(coefficients, heading, durations, mass, J, mixing)
         rotors_hold = low_rotor <= row[0] and row[2] <= high_rotor
         if rotors_hold and holds:
             rotors_hold, row[0], row[2] = prove_rotors(coefficients, yaw, durations, row[0], row[2], *rotors)
@@ -105,4 +105,4 @@ def check_plan(coefficients: Array, yaw: Array, heading: Array, durations: Array
     if not cut:
         where[:] = -1.0
     other = limit_cuts(where, coefficients, yaw, durations, p_S, v_S, s3, low_height, high_height, speed, rate, extension, clearance, offset)
-    return extrema, results, (least, most, checked, rotors_hold, holds, stretch), thrust, other, thrusts
+    return extrema, results, (least, most, checked, rotors_hold, holds, stretch), thrust, other, motions, thrusts

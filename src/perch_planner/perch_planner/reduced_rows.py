@@ -53,9 +53,10 @@ def whitened(program: ProgramArrays, segment: int) -> Array:
 def normalise(rows: Array, lower: Array, upper: Array) -> None:
     """Scale rows and their bounds to unit length."""
     for r in range(len(rows)):
-        scale = 1.0 / max(np.sqrt(np.dot(rows[r], rows[r])), 1e-300)
-        for k in range(rows.shape[1]):
-            rows[r, k] *= scale
+        row = rows[r]
+        scale = 1.0 / max(np.sqrt(np.dot(row, row)), 1e-300)
+        for k in range(len(row)):
+            row[k] *= scale
         lower[r] *= scale
         upper[r] *= scale
 

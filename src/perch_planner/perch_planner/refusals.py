@@ -133,7 +133,8 @@ def check_feasibility(problem: PerchProblem, settings: PerchSettings, limits: Li
     if speed > limits.speed:
         raise PerchRefusal(BOX, "speed of the start state", limits.speed - speed,
                            f"the start speed {speed:.2f} m/s is above the limit {limits.speed:g} m/s")
-    if (slowest := _least_contact_speed(problem, settings)) > limits.speed:
+    slowest = settings.impact_speed_min if at_rest else _least_contact_speed(problem, settings)
+    if slowest > limits.speed:
         raise PerchRefusal(BOX, "speed at the contact", limits.speed - slowest,
                            f"the contact takes a speed of at least {slowest:.2f} m/s in W, more than speed_max {limits.speed:g} m/s")
     if path_length > limits.speed * settings.duration_max and at_rest:

@@ -155,9 +155,9 @@ def thrusts_along(x: Array, heading: Array, mass: float, J: Vector3, mixing: Arr
 
 @compiled
 def _vertex(values: Array, k: int, sign: float) -> tuple[float, float]:
-    """Place and value of the extremum of the parabola through sample k and its neighbours.
+    """Index, with fractions, and value of the extremum of the parabola through sample k and its neighbours.
 
-    The parabola is a function of the sample's index, of which the places are a smooth function.
+    The parabola is a function of the sample's index, of which the places are a smooth function: see `_place`.
     """
     last = len(values) - 1
     middle = min(max(k, 1), last - 1)
@@ -165,13 +165,19 @@ def _vertex(values: Array, k: int, sign: float) -> tuple[float, float]:
     bend = before - 2.0 * here + after
     shift = 0.5 * (before - after) / bend if sign * bend < 0.0 else 2.0
     if abs(shift) > 1.0:
-        return 0.5 - 0.5 * cos(pi * k / last), values[k]
-    return 0.5 - 0.5 * cos(pi * (middle + shift) / last), here - 0.25 * (before - after) * shift
+        return float(k), values[k]
+    return middle + shift, here - 0.25 * (before - after) * shift
 
 
 @compiled
-def sample_rotor_thrusts(coefficients: Array, heading: Array, durations: Array, mass: float, J: Vector3, mixing: Array) -> tuple[Array, Array]:
-    """Rotor thrusts of a plan on the places of each segment that may be bounded, and their extrema.
+def _place(at: float) -> float:
+    """Place in [0, 1] of a sample's index, with fractions."""
+    return 0.5 - 0.5 * cos(pi * at / (_COUNT - 1))
+
+
+@compiled
+def sample_rotor_thrusts(coefficients: Array, heading: Array, durations: Array, mass: float, J: Vector3, mixing: Array) -> tuple[Array, Array, Array]:
+    """Motion and rotor thrusts of a plan on the places of each segment that may be bounded, and their extrema.
 
     Args:
         coefficients: Bernstein coefficients of the position, shape (f, 3, 15) [m].
@@ -180,23 +186,25 @@ def sample_rotor_thrusts(coefficients: Array, heading: Array, durations: Array, 
         mass, J, mixing: from `rotor_model`.
 
     Returns:
-        (thrusts, row): thrusts, shape (f, 4, 49) [N]; row: least and its time, greatest and its time, refined between
-        the samples, shape (4,) [N, s].
+        (motions, thrusts, row): `motion` of each segment, shape (f, 9, 49); thrusts, shape (f, 4, 49) [N]; row: least and its time,
+        greatest and its time, refined between the samples, shape (4,) [N, s].
     """
-    thrusts, row = np.empty((len(durations), 4, _COUNT)), np.array([np.inf, 0.0, -np.inf, 0.0])
+    motions, thrusts = np.empty((len(durations), 9, _COUNT)), np.empty((len(durations), 4, _COUNT))
+    row = np.array([np.inf, 0.0, -np.inf, 0.0])
     begin = 0.0
     for i in range(len(durations)):
         T = durations[i]
-        thrusts_along(motion(coefficients[i], T, _MOTION_BASIS), heading[i], mass, J, mixing, thrusts[i])
+        motions[i] = motion(coefficients[i], T, _MOTION_BASIS)
+        thrusts_along(motions[i], heading[i], mass, J, mixing, thrusts[i])
         for q in range(4):
-            place, value = _vertex(thrusts[i, q], thrusts[i, q].argmin(), -1.0)
+            at, value = _vertex(thrusts[i, q], thrusts[i, q].argmin(), -1.0)
             if value < row[0]:
-                row[0], row[1] = value, begin + place * T
-            place, value = _vertex(thrusts[i, q], thrusts[i, q].argmax(), 1.0)
+                row[0], row[1] = value, begin + _place(at) * T
+            at, value = _vertex(thrusts[i, q], thrusts[i, q].argmax(), 1.0)
             if value > row[2]:
-                row[2], row[3] = value, begin + place * T
+                row[2], row[3] = value, begin + _place(at) * T
         begin += T
-    return thrusts, row
+    return motions, thrusts, row
 
 
 @compiled
@@ -238,14 +246,14 @@ def _functions(program: ProgramArrays, segment: int, at: Indices) -> Array:
 
 
 @compiled
-def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients: Array, heading: Array, low: float, high: float, mass: float,
-               J: Vector3, mixing: Array) -> tuple[Indices, Rows]:
+def rotor_rows(program: ProgramArrays, motions: Array, thrusts: Array, row: Array, heading: Array, low: float, high: float, mass: float, J: Vector3,
+               mixing: Array) -> tuple[Indices, Rows]:
     """Linearised bounds on the rotors that leave [low, high] or are near to it.
 
     Args:
         program: of `reduced_qp.assemble`.
-        thrusts, row: from `sample_rotor_thrusts`; extrema between the places tighten the bounds at the places.
-        coefficients, heading, mass, J, mixing: as for `sample_rotor_thrusts`.
+        motions, thrusts, row: from `sample_rotor_thrusts`; extrema between the places tighten the bounds at the places.
+        heading, mass, J, mixing: as for `sample_rotor_thrusts`.
         low, high: limits of a rotor's thrust [N].
 
     Returns:
@@ -266,7 +274,7 @@ def rotor_rows(program: ProgramArrays, thrusts: Array, row: Array, coefficients:
         n = len(at)
         if n == 0:
             continue
-        x = motion(coefficients[i], durations[i], _MOTION_BASIS)[:, at]
+        x = motions[i][:, at]
         slopes = _slopes(x, heading[i][:, at], mass, J, mixing, thrusts[i][:, at])
         values = _functions(program, i, at)
         for k in range(n):

@@ -94,7 +94,8 @@ def solve(durations: Array, yaw: Array, velocity: Array, problem: tuple[Any, ...
         if not found:
             break
         plan = coefficients(program, w)
-        extrema, results, state, thrust, other, thrusts = check_plan(plan, yaw, heading, durations, plan_limits, rotors, allow_stretch, k > 0)
+        extrema, results, state, thrust, other, motions, thrusts = check_plan(plan, yaw, heading, durations, plan_limits, rotors, allow_stretch,
+                                                                              k > 0)
         least, most, checked, rotors_hold, holds, stretch = state
         programs[k, 0], programs[k, 1] = least, most
         if holds and rotors_hold:
@@ -113,7 +114,7 @@ def solve(durations: Array, yaw: Array, velocity: Array, problem: tuple[Any, ...
         solutions[k] = w
         old_keys = keys
         if len(thrusts) > 0 and violated[2]:
-            keys, local = rotor_rows(program, thrusts, results[ROTOR_THRUST], plan, heading, *rotors)
+            keys, local = rotor_rows(program, motions, thrusts, results[ROTOR_THRUST], heading, *rotors)
             count += len(keys)
         fixed, count = known + cuts, count + cuts
         rows = put(rows, fixed, local)
