@@ -464,6 +464,13 @@ def test_a_vehicle_that_was_started_again_ends_the_goal_and_takes_the_next():
     assert world.goal.ending == "succeeded"
 
 
+@pytest.mark.parametrize("back", [60_000_000, 150_000_000, 300_000_000])
+def test_a_clock_that_is_set_back_a_little_costs_no_goal(back):
+    world = World().send().run(3.0)
+    world.stamp -= back
+    assert world.run().goal.ending == "succeeded"
+
+
 @pytest.mark.parametrize("period", [2_000_000, 10_000_000])
 def test_a_clock_that_was_set_ahead_between_goals_costs_no_goal(period):
     world = World(period=period).run(0.2)

@@ -25,8 +25,7 @@ from perch_control.stamp_guard import Stamp, StampGuard
 STATUS_PERIOD = 20_000_000        # of controller/status [ns]
 DIAGNOSTICS_PERIOD = NANOSECONDS
 DIAGNOSTICS_PHASE = 666_000_000   # not with the status [ns]
-BLIND_AFTER = 80_000_000          # without odometry for so long, IMU samples are answered; motors stop 0.1 s after the last command [ns]
-LATE = BLIND_AFTER                # odometry further behind the newest stamp is not flown on [ns]
+BLIND_AFTER = 80_000_000          # without odometry newer than this, IMU samples are answered; motors stop 0.1 s after the last command [ns]
 LONGEST_PLAN = 60.0               # a way out that starts later does not belong to the running trajectory [s]
 INPUTS_LOST_AFTER = NANOSECONDS   # without any input for so long, a restart of time is accepted in flight, too [ns]
 _FIXED = ("vehicle", "sensors")   # parameters that do not change after the start
@@ -134,7 +133,7 @@ class Controller(Component[ControllerParameters]):
             return
         self._answered, self._silent = self._stamps.newest, False
         late = self._stamps.newest - state.stamp
-        why = problem(state) or (f"{late * 1e-6:.0f} ms behind the newest stamp: late" if late > LATE else "")
+        why = problem(state) or (f"{late * 1e-6:.0f} ms behind the newest stamp: late" if late > BLIND_AFTER else "")
         self._answer(state.stamp, self.flight.step(self._flight_time(state.stamp), (*state.p_WB, *state.v_WB, *state.q_WB, *state.w_B),
                                                    (state.pose_covariance, state.twist_covariance), why))
 
@@ -166,7 +165,6 @@ class Controller(Component[ControllerParameters]):
         elif verdict is Stamp.SET_BACK:
             self.warn(f"{channel}: time has been set back to {seconds(stamp):.3f} s")
             by = self._stamps.set_back - set_back
-            self._command_stamp -= by
             self._answered = self._answered and self._answered - by
             self._first = self._first and self._first - by
             if before - stamp > STALE:
@@ -294,13 +292,13 @@ class Controller(Component[ControllerParameters]):
     def _answer(self, stamp: int, result: StepResult) -> None:
         """Emit the command to the vehicle first, then the periodic outputs, on one time grid from the first answer on."""
         loop = result.loop
-        self._command_stamp = stamp = max(stamp, self._command_stamp)  # a vehicle ignores a command older than the one before
+        self._command_stamp = sent = max(stamp, self._command_stamp)  # a vehicle ignores a command older than the one before
         if loop is None:
-            self.motor_command(MotorCommand(stamp, result.armed, result.rotor_speed))
+            self.motor_command(MotorCommand(sent, result.armed, result.rotor_speed))
         elif self._to_vehicle is self.rates_thrust:
-            self.rates_thrust(RatesThrust(stamp, result.armed, loop.w_B, loop.thrust))
+            self.rates_thrust(RatesThrust(sent, result.armed, loop.w_B, loop.thrust))
         else:
-            self.attitude_thrust(AttitudeThrust(stamp, result.armed, loop.q_WB, loop.w_B, loop.thrust))
+            self.attitude_thrust(AttitudeThrust(sent, result.armed, loop.q_WB, loop.w_B, loop.thrust))
         self._steps += 1
         if result.event:
             (self.warn if self.flight.odometry_refusal else self.info)(result.event)
@@ -308,7 +306,7 @@ class Controller(Component[ControllerParameters]):
         if self._first is None:
             self._first = now
         if now - self._first >= self._due:
-            self._emit_periodic(now, now - self._first, stamp, result)
+            self._emit_periodic(now, now - self._first, sent, result)
 
     def _emit_periodic(self, now: int, since: int, stamp: int, result: StepResult) -> None:
         """Emit the periodic outputs that are due; `since`: time since the first answer [ns]."""

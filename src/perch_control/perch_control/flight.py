@@ -315,8 +315,11 @@ class FlightController:
         if x.blind is not None:
             if not x.blind.landed and x.blind.age <= self.supervisor.longest_landing:
                 return actuation.descend(x, x.blind)
-            x = (self._landed(x, "landed without position, motors off") if x.blind.landed else
-                 motors_off(x, State.FAILED, f"descent without position: no ground contact within {self.supervisor.longest_landing:.0f} s, motors off"))
+            if x.blind.landed:
+                x = self._landed(x, "landed without position, motors off")
+            else:
+                longest = self.supervisor.longest_landing
+                x = motors_off(x, State.FAILED, f"descent without position: no ground contact within {longest:.0f} s, motors off")
         elif x.flying:
             setpoint = self.supervisor.setpoint(x)
             x, result = actuation.fly(x, setpoint, self.law, self.compensator, self._period.value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 
 _JUMP = 1_000_000_000    # further behind the newest stamp than this, a stamp is not current [ns] ...
-_STEP = 80_000_000       # the same ahead of the newest, or behind the newest of its own stream [ns] ...
+_STEP = 80_000_000       # the same ahead of the newest or, without a restart, behind the newest of its own stream [ns] ...
 _CONFIRM = 50_000_000    # ... unless one stream has had such stamps, increasing, for so long, and none was current [ns]
 
 
@@ -42,7 +42,7 @@ class StampGuard:
             may_restart: whether stamps of the past may be those of a restart; otherwise the clock has been set back, and time goes on.
         """
         newest = self.newest
-        if not self.initialised or -_JUMP <= stamp - newest <= _STEP and stamp >= self._last.get(stream, stamp) - _STEP:
+        if not self.initialised or -_JUMP <= stamp - newest <= _STEP and (may_restart or stamp >= self._last.get(stream, stamp) - _STEP):
             self._unconfirmed.clear()
             self._last[stream] = max(stamp, self._last.get(stream, stamp))
             self.newest, self.initialised = max(stamp, newest) if self.initialised else stamp, True

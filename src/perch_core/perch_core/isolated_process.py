@@ -21,7 +21,7 @@ from perch_core.isolated import _HEADER
 from perch_core.processes import end_with_parent
 
 OUT_OF_MEMORY = 42
-"""Exit status of a child that ran out of memory: what a job has left of it may not suffice for any further one."""
+"""Exit status of a child that ran out of memory. It is replaced, as too little may be left for the next job."""
 
 
 def _answer(payload: bytes) -> bytes:

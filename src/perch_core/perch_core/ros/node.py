@@ -6,6 +6,7 @@ import inspect
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -128,7 +129,8 @@ def spin_until_stopped(executor: Executor, stop: StopSignal, on_failure: Callabl
     Args:
         executor: its first node gets a timer.
         stop: the signal.
-        on_failure: called with `executor` and an exception that leaves a callback; the executor then continues. None: it is raised.
+        on_failure: called with `executor` and an exception that leaves a callback; the executor then continues; messages that
+            waited with it are handled when others arrive. None: it is raised.
 
     EventsExecutor.spin() does not return on shutdown in rclpy 7.1.6, and spin_once() restarts for every message, which
     costs 30 us each. Therefore this function waits for a future, 0.1 s at a time. The executor checks this time-out only when no
@@ -148,6 +150,7 @@ def spin_until_stopped(executor: Executor, stop: StopSignal, on_failure: Callabl
             if on_failure is None:
                 raise
             on_failure("executor", error)
+            time.sleep(0.001)  # one that fails at once, each time, leaves time for other threads
 
 
 def connect(nodes: Sequence[ComponentNode], executor: Any) -> None:
