@@ -407,7 +407,9 @@ def test_a_pilot_who_hands_over_to_a_disarmed_controller_in_flight_keeps_the_mot
 
     assert sent(True, OFFBOARD) == {"SET_ATTITUDE_TARGET"}
     assert sent(True, 0) == {"SET_ATTITUDE_TARGET"}, "without set points PX4 does not let him hand over"
+    assert not any("a pilot flies" in line.text for line in autopilot.got["log"])
     assert sent(False, 0) == set() and not any("motors off" in line.text for line in autopilot.got["log"])
+    assert autopilot.got["log"][-1].text == "a pilot flies: arm the controller before selecting the mode"
     assert sent(False, OFFBOARD) == set() and "until the autopilot is disarmed by its pilot" in autopilot.got["log"][-1].text
     assert sent(True, OFFBOARD) == {"SET_ATTITUDE_TARGET"}
     assert sent(False, OFFBOARD) == {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}
@@ -496,6 +498,9 @@ def test_a_heartbeat_of_before_kill_does_not_end_it():
     machine.arming.command(0.9, True)
     machine.kill(1.0)
     machine.heartbeat(1.1, PX4, 0, OFFBOARD)
+    machine.arming.command(1.15, False)
+    assert machine.arming.stop is Stop.KILL
+    machine.arming.command(2.0, True)
     machine.heartbeat(2.1, PX4, ARMED, OFFBOARD)
     assert machine.next_request(2.1, True, True) is Request.DISARM
     machine.heartbeat(3.1, PX4, 0, OFFBOARD)

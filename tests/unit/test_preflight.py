@@ -97,11 +97,21 @@ def test_cameras_and_extrinsics_are_compared_with_the_file():
     for wrong in (model._replace(frame="down"), None):
         assert checks.check_camera_model("down", wrong, VEHICLE).verdict is FAILED
     frames = list(fixed_frames(VEHICLE))
-    assert {check.verdict for check in checks.check_extrinsics(frames, VEHICLE)} == {PASSED}
-    assert {check.verdict for check in checks.check_extrinsics([], VEHICLE)} == {OPEN}
+    assert {check.verdict for check in checks.check_extrinsics(frames, VEHICLE, VEHICLE)} == {PASSED}
+    assert {check.verdict for check in checks.check_extrinsics([], VEHICLE, VEHICLE)} == {OPEN}
     moved = [f._replace(p=(f.p[0] + 0.05, *f.p[1:])) if f.child.startswith("camera_front") else f for f in frames]
-    failed = [check.name for check in checks.check_extrinsics(moved, VEHICLE) if check.verdict is FAILED]
+    failed = [check.name for check in checks.check_extrinsics(moved, VEHICLE, VEHICLE) if check.verdict is FAILED]
     assert failed == ["extrinsics camera_front_optical_frame"]
+
+
+def test_cameras_of_a_sensor_file_may_be_mounted_otherwise_than_description_has_them():
+    file = described(down=RADTAN)
+    frames = list(fixed_frames(VEHICLE))
+    check = next(check for check in checks.check_extrinsics(frames, VEHICLE, file) if "camera_down" in check.name)
+    assert check.verdict is OPEN and "`extrinsics: file`" in check.advice
+    assert {check.name: "description" in check.advice for check in checks.check_extrinsics([], VEHICLE, file)} == {
+        f"extrinsics {f.child}": not f.child.startswith("camera") for f in fixed_frames(VEHICLE, file.mounts)}
+    assert [check.verdict for check in checks.check_stream("camera_down/camera_info", [0], OPEN)] == [FAILED]
 
 
 def described(**cameras):
@@ -123,9 +133,12 @@ def test_cameras_of_a_sensor_file_are_those_that_are_compared(sensor, monkeypatc
                                     "camera_down/camera_info": [(0.0, model)], "camera_cam0/camera_info": []})
     graph.newest = lambda channel: graph.values[channel][-1][1] if graph.values[channel] else None
     graph.arrivals_and_stamps = lambda channel: []
-    seen = verdicts(command.passive_checks(graph, VEHICLE, "mine"))
+    cameras = command.described_cameras(VEHICLE, "mine")
+    seen = verdicts(command.passive_checks(graph, VEHICLE, cameras, "mine"))
     assert seen["camera_down model"] is seen["extrinsics camera_down_optical_frame"] is seen["extrinsics camera_cam0_optical_frame"] is PASSED
-    assert seen["camera_cam0 model"] is FAILED and not any("front" in name for name in seen)
+    assert seen["camera_cam0 model"] is seen["rate camera_cam0/camera_info"] is OPEN, "the nodes use the file's"
+    assert seen["rate camera_down/camera_info"] is seen["rate imu/data_raw"] is FAILED
+    assert [(name, seen[name]) for name in seen if "front" in name] == [("camera_front", OPEN)], "it is not described"
     rates = np.random.default_rng(6).standard_normal((60, 3))
     assert checks.check_rotation("cam0", rates, rates @ mounts["cam0"].R_BC, described(cam0=RADTAN)).verdict is PASSED
     monkeypatch.setattr(command, "load_sensors", lambda name: Sensors(name="mine"))
@@ -133,12 +146,14 @@ def test_cameras_of_a_sensor_file_are_those_that_are_compared(sensor, monkeypatc
 
 
 @pytest.mark.parametrize("sent, words", [
-    ({"distortion": (-0.1, 0.07, 0.0002, 0.0)}, "lens differ: mine has 640 x 480 px, plumb_bob"), ({"distortion": ()}, "lens differ"),
-    ({"model": "equidistant"}, "lens differ"), ({"width": 320}, "image size differ"), ({"width": 320, "focal": (200.0, 200.0)}, "image size and lens")])
+    ({"distortion": (-0.1, 0.07, 0.0002, 0.0)}, "lens differs: mine has 640 x 480 px, plumb_bob"), ({"distortion": ()}, "lens differs:"),
+    ({"model": "equidistant"}, "lens differs:"), ({"width": 320}, "image size differs:"),
+    ({"width": 320, "focal": (200.0, 200.0)}, "image size and lens differ:")])
 def test_what_differs_from_the_sensor_file_is_named(sent, words):
     model = CameraModel(0, "of its driver", replace(RADTAN, **sent).camera)
     check = checks.check_camera_model("cam0", model, described(cam0=RADTAN))
     assert check.verdict is FAILED and words in check.advice and "distortion [-0.28, 0.07, 0.0002, 0.0" in check.advice
+    assert "frame" not in check.advice
 
 
 @pytest.mark.parametrize("name", ["left eye", "a.b", "stereo-left"])

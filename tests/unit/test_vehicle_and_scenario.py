@@ -53,6 +53,7 @@ def test_hover_is_an_equilibrium_and_spin_follows_euler():
     ({"inertia": [6e-2, 6e-2, 6e-2]}, "can have"), ({"thrust_coefficient": 1e-3}, "is outside (0, 1000] N"), ({"speed_min": 1700.0}, "cannot descend"),
     ({"body_rate_max": 1e9}, "body_rate_max: 1e+09 is outside (0, 10000] rad/s"), ({"name": "../x"}, "'../x' is no name"),
     ({"cameras": {"a/b": {}}}, "'a/b' is no name"),
+    ({"perch_offset": 0.3, "ground_offset": 0.1461}, "ground_offset: 0.1461 m: its plate or gripper would be in the ground, 0.3 m below"),
 ])
 def test_a_vehicle_that_no_vehicle_can_be_is_refused(change, words):
     content = config.read_yaml(config.find("vehicles", "snapdragon"))

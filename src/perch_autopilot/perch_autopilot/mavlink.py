@@ -182,6 +182,8 @@ class Mavlink(Component[MavlinkParameters]):
                 self.log(LogLine("error", f"{stop.value}: commands with the motors on are not obeyed until they have them off" if stop and command.armed
                                  else "commands have the motors off, but a flight may have begun before them (was the controller started "
                                  "again?): not obeyed until the autopilot is disarmed by its pilot or its failsafe", 2.0))
+            elif self.offboard.alive(now * 1e-9):
+                self.log(LogLine("info", "a pilot flies: arm the controller before selecting the mode", 10.0))
             command = None
         if command is not None:
             self._send_set_point(command)

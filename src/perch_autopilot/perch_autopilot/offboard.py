@@ -68,9 +68,11 @@ class Offboard:
         """Record a heartbeat of the autopilot at a time [s]."""
         self._last_heartbeat, self.autopilot, self.armed = now, autopilot, bool(base_mode & ARMED)
         self.following = custom_mode == self.mode
-        self.arming.report(now, self.armed)
-        if not self.armed and now - (self._disarm_until - KILL_TIME) >= LATENCY:  # else it may be of before KILL
-            self._disarm_until = -1e9
+        stale = not self.armed and now - (self._disarm_until - KILL_TIME) < LATENCY  # may be of before KILL
+        if not stale:
+            self.arming.report(now, self.armed)
+            if not self.armed:
+                self._disarm_until = -1e9
 
     def set_time(self, now: float) -> None:
         """Take a time [s] of a clock that has jumped; commands have had no gap by it."""
@@ -94,7 +96,8 @@ class Offboard:
     def obeys(self, armed: bool) -> bool:
         """Return whether the autopilot may be sent a command with the motors on (`armed`) or off.
 
-        Set points without thrust would let a pilot who flies in another mode select theirs. After a lost link the mode is not known.
+        In another mode, set points without thrust would let its pilot enter this mode, and stop the motors. After a lost link the mode
+        is unknown.
         """
         elsewhere = not self.following and self._last_heartbeat > -1e9
         return self.arming.stop is None if armed else not self.armed or self.commanding and not elsewhere

@@ -175,6 +175,8 @@ class Vehicle:
             ("speed_max", self.thrust_max > DEFAULT_BOUNDS["N"] and f"{self.thrust_max:.4g} N of a rotor is outside (0, {DEFAULT_BOUNDS['N']:g}] N"),
             ("speed_max", 4 * self.thrust_max <= self.hover_thrust and f"total thrust {4 * self.thrust_max:.2f} N cannot lift {self.mass:g} kg"),
             ("speed_min", 4 * self.thrust_min >= self.hover_thrust and f"with an idle thrust of {4 * self.thrust_min:.2f} N it cannot descend"),
+            ("ground_offset", self.standing_height < self.perch_offset - 0.1 and f"{self.standing_height:g} m: its plate or gripper would be in the "
+             f"ground, {self.perch_offset:g} m below the centre of mass; a file that changes perch_offset states ground_offset too"),
         ):
             if problem:
                 raise ConfigError("", key, problem)

@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     out.add_argument("--namespace", default="", help="namespace of its nodes")
     out.add_argument("--listen", type=float, default=5.0, metavar="S", help="how long to listen (default: %(default)s)")
     out.add_argument("--shake", metavar="CAMERA",
-                     help="camera, as down, whose rotation to the IMU is checked; rotate the vehicle by hand for 10 s when asked")
+                     help="name of the camera, for example down, whose rotation to the IMU is checked; rotate the vehicle by hand for 10 s when asked")
     out.add_argument("--props-off", action="store_true", help="no propellers are mounted: the motors may be started")
     out.add_argument("--takeover", action="store_true", help="with --props-off: the pilot will take over, with the pilot's arming switch off")
     out.add_argument("--watchdog", action="store_true", help="with --props-off: the controller will be stopped by hand")
@@ -59,24 +59,26 @@ def described_cameras(vehicle: Vehicle, sensors: str) -> Vehicle | Sensors:
     return described if described and described.cameras else vehicle
 
 
-def passive_checks(listener: Any, vehicle: Vehicle, sensors: str) -> list[Check]:
-    """Return the checks of a vehicle at rest."""
-    cameras = described_cameras(vehicle, sensors)
+def passive_checks(listener: Any, vehicle: Vehicle, cameras: Vehicle | Sensors, sensors: str) -> list[Check]:
+    """Return the checks of a vehicle at rest, with the cameras of `described_cameras`."""
     values = {channel: [value for _, value in entries] for channel, entries in listener.values.items()}
-    channels = ("imu/data_raw", "odometry", *(f"camera_{name}/camera_info" for name in cameras.mounts))
-    found = [check for channel in channels for check in checks.check_stream(channel, [value.stamp for value in values[channel]])]
+    silence = {f"camera_{name}/camera_info": checks.without_camera_info(cameras) for name in cameras.mounts}
+    found = [check for channel in ("imu/data_raw", "odometry", *silence)
+             for check in checks.check_stream(channel, [value.stamp for value in values[channel]], silence.get(channel, Verdict.FAILED))]
     frames = {name: listener.arrivals_and_stamps(f"camera_{name}/camera_info") for name in cameras.mounts}
     found += checks.check_clocks(listener.arrivals_and_stamps("imu/data_raw"), frames)
     imu = imu_in_body(listener, sensors)
     found += checks.check_frames(listener.newest("odometry"), listener.newest("imu/data_raw"), bool(imu))
     found += checks.check_at_rest(imu)
     found += [checks.check_camera_model(name, listener.newest(f"camera_{name}/camera_info"), cameras) for name in cameras.mounts]
-    return found + checks.check_extrinsics(values["/tf_static"], vehicle, cameras.mounts)
+    found += [Check(f"camera_{name}", Verdict.OPEN, f"not in {cameras.name}", "check it in a run without --sensors, if a node uses it")
+              for name in vehicle.mounts if name not in cameras.mounts]
+    return found + checks.check_extrinsics(values["/tf_static"], vehicle, cameras)
 
 
-def rotation_check(listener: Any, vehicle: Vehicle, camera: str | None, sensors: str) -> Check:
+def rotation_check(listener: Any, cameras: Vehicle | Sensors, camera: str | None, sensors: str) -> Check:
     """Ask for the vehicle to be rotated and check the rotation between camera and IMU; without a camera it is not exercised."""
-    turned, cameras = (np.zeros((0, 3)), np.zeros((0, 3))), described_cameras(vehicle, sensors)
+    turned = np.zeros((0, 3)), np.zeros((0, 3))
     if camera:
         listener.subscribe_camera(camera, cameras.mounts[camera].camera)
         print("rotate the vehicle back and forth about all axes for 10 s ...", flush=True)
@@ -142,7 +144,8 @@ def _check(arguments: argparse.Namespace) -> int:
         print(f"listening for {arguments.listen:g} s: the vehicle must stand still on its feet ...", flush=True)
         listener.await_first("imu/data_raw", arguments.listen)
         listener.spin_for(arguments.listen)
-        found = [*passive_checks(listener, vehicle, arguments.sensors), rotation_check(listener, vehicle, arguments.shake, arguments.sensors),
+        found = [*passive_checks(listener, vehicle, cameras, arguments.sensors),
+                 rotation_check(listener, cameras, arguments.shake, arguments.sensors),
                  *active_checks(listener, arguments, checks.STOP_TIME if vehicle.actuation.type == "rotor_speeds" else checks.DESCENT_TIME)]
     print("\n".join(map(str, found)))
     counts = {verdict: sum(check.verdict is verdict for check in found) for verdict in Verdict}

@@ -156,7 +156,7 @@ def _solve(camera, corners_S, rays_C, sigma, ids, lens_sigma, print_sigma, prior
 
 
 def planar_branches(points_S: np.ndarray, rays_C: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the up to two poses of a planar target that IPPE finds, best first, as (p_CS, R_CS); none where a ray is 87 deg from their mean.
+    """Return the up to two poses of a planar target that IPPE finds, best first, as (p_CS, R_CS); none where a ray is 87 deg or more from their mean.
 
     Args:
         points_S: coplanar points with z_S = 0, shape (k, 3), k >= 4.

@@ -135,7 +135,7 @@ class Estimator:
             attitude = float(np.sqrt(diagonal[at.D_ATTITUDE].max()))
             lost = position > _LOST_POSITION or attitude > _LOST_ATTITUDE
             health = Health.DIVERGED if lost else Health.COASTING if age > self.config.coasting_after else Health.RUNNING
-            message = f"1 sigma of {position:.1f} m and {attitude:.2f} rad is too uncertain" if lost else message
+            message = f"1 sigma of {position:.1f} m and {attitude:.2f} rad is too uncertain; {message}" if lost else message
         return Status(health, age, self._accepted, self._rejected, self._divergences, self._nis, self._nis_dimension, position, attitude, message)
 
     def _compile(self) -> None:

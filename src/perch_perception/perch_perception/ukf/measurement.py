@@ -138,7 +138,7 @@ class Status:
         broken: number of divergences: covariance not positive definite, or state not finite; each causes a restart.
         nis, nis_dimension: normalised innovation squared of the last pose that reached the gate, and its dimension.
         position_sigma, attitude_sigma: largest 1 sigma [m], [rad]; inf without an estimate.
-        message: human-readable last event; where the state is too uncertain to be used, this.
+        message: human-readable last event, after its uncertainty where the state is too uncertain to be used.
     """
 
     health: Health

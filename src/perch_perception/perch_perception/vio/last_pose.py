@@ -13,7 +13,7 @@ from perch_perception.vio import state as at
 from perch_perception.vio.preintegration import preintegrate
 from perch_perception.vio.start import KnownPose
 
-_ANYWHERE = 1000.0  # 1 sigma of a position of which nothing is known: none is larger, as receivers refuse such covariances [m]
+_ANYWHERE = 1000.0  # 1 sigma of a position of which nothing is known; none is larger: receivers refuse more than 10 km [m]
 
 
 class LastPose:
