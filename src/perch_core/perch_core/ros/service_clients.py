@@ -13,7 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 DISCOVERY_TIMEOUT = 5.0  # a request fails after so long without a server; a node that has just started discovers it later [s]
-ANSWER_TIMEOUT = 50.0    # a request fails so long after it was made: more than a plan may take, less than `lockstep_timeout` [s]
+ANSWER_TIMEOUT = 50.0    # a request fails so long after it was made: more than a plan may take, less than a simulated vehicle waits [s]
 CHECK_PERIOD = 0.1       # of the check for servers while a request is open [s]
 WATCH_PERIOD = 1.0       # of the check for new servers [s]
 
