@@ -409,7 +409,7 @@ def test_a_pilot_who_hands_over_to_a_disarmed_controller_in_flight_keeps_the_mot
     assert sent(True, 0) == {"SET_ATTITUDE_TARGET"}, "without set points PX4 does not let him hand over"
     assert not any("a pilot flies" in line.text for line in autopilot.got["log"])
     assert sent(False, 0) == set() and not any("motors off" in line.text for line in autopilot.got["log"])
-    assert autopilot.got["log"][-1].text == "a pilot flies: arm the controller before selecting the mode"
+    assert autopilot.got["log"][-1].text == "a pilot flies: select this mode only while the controller flies (TRACKING or HOVERING), or on the ground"
     assert sent(False, OFFBOARD) == set() and "until the autopilot is disarmed by its pilot" in autopilot.got["log"][-1].text
     assert sent(True, OFFBOARD) == {"SET_ATTITUDE_TARGET"}
     assert sent(False, OFFBOARD) == {"SET_ATTITUDE_TARGET", "COMMAND_LONG"}

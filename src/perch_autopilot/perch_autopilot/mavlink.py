@@ -183,7 +183,7 @@ class Mavlink(Component[MavlinkParameters]):
                                  else "commands have the motors off, but a flight may have begun before them (was the controller started "
                                  "again?): not obeyed until the autopilot is disarmed by its pilot or its failsafe", 2.0))
             elif self.offboard.alive(now * 1e-9):
-                self.log(LogLine("info", "a pilot flies: arm the controller before selecting the mode", 10.0))
+                self.log(LogLine("info", "a pilot flies: select this mode only while the controller flies (TRACKING or HOVERING), or on the ground", 10.0))
             command = None
         if command is not None:
             self._send_set_point(command)

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 UNNAMED = "_NODE_NAME_UNKNOWN_"  # of rcl, for a publisher that was discovered before its node
-OBSERVERS = ("recorder", "viewer", "preflight", "rosbag2_", "foxglove_bridge", "rqt_", "plotjuggler", "_")
+OBSERVERS = ("recorder", "viewer", "preflight", "rosbag2_", "foxglove_bridge", "rqt_", "rviz", "plotjuggler", "_")
 """Beginnings of the names of nodes that only observe. A leading underscore hides a node, as those of the command line `ros2`."""
 CHECK_PERIOD = 0.1     # of the check for subscribers, which takes 5 us [s]
 BUNDLE_PERIOD = 0.008  # of the publication of messages without urgency [s]

@@ -26,7 +26,7 @@ EXAMPLES = """examples:
   python3 scripts/preflight.py --vehicle mine.yaml --props-off --watchdog   then wait until you stop the controller, and check that the motors stop
 
 exit code: 0 nothing has failed, 1 something has, 2 wrong arguments"""
-USER_TIMEOUT = 60.0  # for an action by hand [s]
+USER_TIMEOUT = 9.0   # for an action by hand: soon after, the armed controller stops the motors by itself [s]
 REPORT_TIME = 1.5    # for the autopilot to report that it is disarmed, before which a KILL is not over: MAVLink's heartbeats come once a second [s]
 
 
