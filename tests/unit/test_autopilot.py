@@ -125,6 +125,13 @@ def test_the_rate_curve_is_inverted(centre, more, expo, share):
     assert curve.rate(curve.stick(wanted)) == pytest.approx(wanted, abs=0.003 * (centre + 6 * more) + 1e-6)
 
 
+@given(centre=st.floats(10, 1500), more=st.floats(0, 1000), expo=st.floats(0, 1), stick=st.floats(-1, 1))
+def test_the_rate_curve_is_that_of_the_firmware(centre, more, expo, stick):
+    """As `applyActualRates` of Betaflight 4.6 computes it: expof = |s| (s^5 e + s (1 - e)), rate = s c + max(0, m - c) expof."""
+    expof = abs(stick) * (np.power(stick, 5) * expo + stick * (1.0 - expo))
+    assert RateCurve(centre, centre + more, expo).rate(stick) == pytest.approx(stick * centre + max(0.0, more) * expof, abs=1e-9 * centre)
+
+
 def test_sticks_have_the_directions_of_a_pilot():
     sticks = Sticks(VEHICLE, rate_curves(load_configuration("betaflight").settings, ""))
     centre = sticks.channels((0.0, 0.0, 0.0), 9.81)

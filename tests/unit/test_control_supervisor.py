@@ -7,18 +7,19 @@ import pytest
 
 from closed_loop.loop import make_loop, perch
 from perch_control import monitors
-from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints
+from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_order, check_start
 from perch_control.flight_settings import FlightSettings
 from perch_control.guidance import Blend, Hold, Polynomial, blended, brake, quintic
 from perch_control.maneuvers import following, recovered
 from perch_control.modes import CommandRefused, State
 from perch_control.odometry_gate import OdometryGate
 from perch_control.sensor_inputs import SensorInputs
-from perch_control.reference import FlatReference, SampledReference
+from perch_control.reference import FlatReference, SampledReference, Setpoint
 from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory, rest_to_rest
-from perch_core.values import Command
+from perch_core.values import Command, TrajectoryOrder
+from perch_core.vehicle import load_vehicle
 
 REST = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -215,6 +216,54 @@ def test_trajectories_that_jump_inside_are_refused():
         check_joints(SampledTrajectory(**bad))
 
 
+def test_trajectories_whose_velocity_jumps_inside_are_refused():
+    """Positions are continuous: 0.5 m/s to rest, and 1 to 2 m/s within 10 ms, in which the hardest flight gains 0.6 m/s."""
+    c = np.zeros((2, 4, 2))
+    c[:, 0], c[:, 2] = ((0.0, 1.0), (1.0, 1.0)), 1.2
+    with pytest.raises(TrajectoryRefused, match="velocity jumps by 0.500 m/s at 2.000 s"):
+        check_joints(FlatTrajectory(np.array([2.0, 1.0]), c))
+    times = np.linspace(0.0, 1.0, 101)
+    for begin, end, jumps in ((1.0, 2.0, True), (1.0, 1.7, False)):
+        v = np.outer(np.where(times > 0.5, end, begin), (1.0, 0.0, 0.0))
+        p = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (v[1:] + v[:-1]) * 0.01, axis=0)])
+        samples = SampledTrajectory(times, p, np.tile((0, 0, 0, 1.0), (101, 1)), v, np.zeros((101, 3)), np.zeros((101, 3)), np.zeros((101, 3)),
+                                    np.full((101, 4), 0.6))
+        if jumps:
+            with pytest.raises(TrajectoryRefused, match="velocity jumps by .* at 0.510 s"):
+                check_joints(samples)
+        else:
+            check_joints(samples)
+
+
+@pytest.mark.parametrize("place, velocity, start, why", [
+    ((0.3, 0.0, 0.0), (0.0, 0.0, 0.9), 5.0, ""), ((0.0, 0.36, 0.0), (0.0,) * 3, 5.0, "starts 0.36 m away from the vehicle"),
+    ((0.0,) * 3, (0.0, 1.1, 0.0), 5.0, "starts 1.10 m/s from the vehicle's velocity"), ((0.0,) * 3, (0.0,) * 3, 4.6, ""),
+    ((0.0,) * 3, (0.0,) * 3, 4.4, "starts 0.60 s in the past"), ((0.0,) * 3, (0.0,) * 3, 66.0, "starts 61.00 s in the future")])
+def test_a_trajectory_begins_where_and_when_the_vehicle_is_and_as_fast(place, velocity, start, why):
+    """A step of the velocity that feedback has to make up for is as bad as one of the place."""
+    at_rest = FlatReference(FlatTrajectory(np.array([2.0]), np.zeros((1, 4, 2))))
+    present = Setpoint(place, velocity)
+    if why:
+        with pytest.raises(TrajectoryRefused, match=why):
+            check_start(Order(1, at_rest, start), 5.0, present)
+    else:
+        check_start(Order(1, at_rest, start), 5.0, present)
+
+
+@pytest.mark.parametrize("duration, x, why", [
+    (0.2, (0.0, 19.0), ""), (0.2, (0.0, 21.0), "velocity of 105 is beyond 100"), (0.05, (0.0, 0.0, 1.2), ""),
+    (0.05, (0.0, 0.0, 1.3), "acceleration of 1040 is beyond 1000")])
+def test_polynomials_with_derivatives_that_no_vehicle_flies_are_refused(duration, x, why):
+    c = np.zeros((1, 4, len(x)))
+    c[0, 0] = x
+    order = TrajectoryOrder.of(1, FlatTrajectory(np.array([duration]), c))
+    if why:
+        with pytest.raises(TrajectoryRefused, match=why):
+            check_order(order, load_vehicle("snapdragon"))
+    else:
+        check_order(order, load_vehicle("snapdragon"))
+
+
 def test_sampled_trajectory_is_flown():
     trajectory = rest_to_rest(np.array([0, 0, 1.2]), np.array([1.5, 0.5, 1.4]), 0, 0, 1.5)
     from perch_core.flatness import flat_to_state
@@ -318,6 +367,34 @@ def test_each_fault_leads_to_its_answer(fault, expected, word, monkeypatch):
     reached = loop.controller.state is expected and word in flight.flight_state.message
     reached = reached or loop.run(3.0, until=lambda x: x.controller.state is expected and word in flight.flight_state.message)
     assert reached, (loop.controller.state, flight.flight_state.message, loop.events)
+
+
+@pytest.mark.parametrize("p, outside", [
+    ((-1.5, 0.0, 0.0), 0.5), ((2.25, 0.0, 0.0), 0.25), ((0.0, -3.5, 0.0), 0.5), ((0.0, 4.75, 0.0), 0.75), ((0.0, 0.0, -5.125), 0.125),
+    ((0.0, 0.0, 7.0), 1.0), ((-1.5, 6.0, 5.0), 2.0), ((-1.0, 4.0, 6.0), 0.0), ((1.9, -2.9, -4.9), 0.0)])
+def test_every_side_of_the_geofence_counts(p, outside):
+    fence = FlightSettings(fence_low=(-1.0, -3.0, -5.0), fence_high=(2.0, 4.0, 6.0))
+    assert monitors.TrackingMonitor(fence, 8.0).outside(p) == outside
+
+
+def test_a_recovery_that_does_not_come_to_rest_descends_after_six_seconds():
+    """Odometry that shows a vehicle which never slows down: it cannot recover by it for ever."""
+    loop = hovering()
+    x = recovered(loop.controller.flight_state, "for a test")
+    x = x._replace(state_estimate=(*x.state_estimate[:3], 3.0, 0.0, 0.0, *x.state_estimate[6:]))
+    supervisor = loop.controller.supervisor
+    assert supervisor.act(x._replace(now=x.now + 5.9), False).mode is State.RECOVERING
+    after = supervisor.act(x._replace(now=x.now + 6.1), False)
+    assert after.mode is State.LANDING and after.message == "landing: the recovery did not come to rest"
+
+
+@pytest.mark.parametrize("at_end, mode, message", [(AtEnd.LAND, State.LANDING, "landing after trajectory 3"),
+                                                   (AtEnd.HOLD, State.HOVERING, "hovering at the end of trajectory 3")])
+def test_a_trajectory_ends_as_its_order_says(at_end, mode, message):
+    loop = hovering()
+    loop.follow(rest_to_rest(loop.plant.p, loop.plant.p, 0, 0, 0.2), at_end, id=3)
+    loop.run(0.26)
+    assert (loop.controller.state, loop.controller.flight_state.message) == (mode, message)
 
 
 def test_a_geofence_without_an_inside_is_refused():

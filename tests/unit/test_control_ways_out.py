@@ -66,6 +66,12 @@ def test_a_velocity_that_cannot_be_is_not_braked():
     assert descent((2.0, 0.0, 0.0)).wrench()[2] < 0.0, "moving along +x, the vehicle leans back"
 
 
+def test_a_descent_brakes_a_climb_and_a_fast_fall_and_lets_a_slow_one_go_on():
+    thrust = {climb: descent((0.0, 0.0, climb)).wrench()[0] for climb in (2.0, 0.5, 0.0, -0.5, -1.0, -3.0)}
+    weight = load_vehicle("snapdragon").mass * 9.81
+    assert thrust[2.0] < thrust[0.5] < thrust[0.0] == thrust[-0.5] < weight < thrust[-1.0] < thrust[-3.0]
+
+
 def test_lost_vio_does_not_brake_into_the_wall():
     plan = perch("surface_90_1.7m")
 

@@ -186,6 +186,10 @@ def test_height_comes_before_braking():
     assert np.degrees(np.arctan2(gently[0], gently[2])) == pytest.approx(20.0 - np.degrees(0.08), abs=0.1)
 
 
+def test_a_weak_landing_keeps_thrust_for_the_moments_while_it_still_climbs():
+    assert demand((0.0, 0.0, 3.0), 1.0, 1.3 * GRAVITY)[2] == pytest.approx(0.6 * GRAVITY)
+
+
 @pytest.mark.parametrize("seed, repeated", [(11, False), (20, True)])
 def test_a_perching_flight_on_weak_rotors_has_a_good_end_and_is_repeatable(seed, repeated):
     """117 % and 101 % of the weight are left, during the dip before the wall: moment and size are drawn, and the same seed is the same flight."""

@@ -515,10 +515,15 @@ def test_a_map_with_lines_that_are_none_is_ignored(end, what_becomes):
 
 
 @pytest.mark.parametrize("ahead, said", [(2 * 10**9, True), (-(10**9) * 3600, False)])
-def test_a_map_of_the_future_is_ignored_with_a_word_and_an_old_one_is_taken(ahead, said):
-    flight = hovering()
-    flight.component.on_powerlines(PowerlineMap(flight.stamp + ahead, (), False, ""))
-    assert ("in the future" in flight.said) == said
+def test_a_map_of_the_future_is_ignored_with_a_word_and_an_old_one_is_taken(ahead, said, monkeypatch):
+    params = parameters()
+    flight, taken = Flight(params=replace(params, nmpc=replace(params.nmpc, lines=replace(params.nmpc.lines, collision=1.0)))), []
+    flight.stamp += 2 * 3600 * NANOSECONDS
+    flight.step(0.01)
+    monkeypatch.setattr(flight.component._assembly, "set_lines", taken.extend)
+    line = MappedPowerline(1, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.01, np.eye(3), 0.1, 3)
+    flight.component.on_powerlines(PowerlineMap(flight.stamp + ahead, (line,), False, ""))
+    assert ("in the future" in flight.said) == said and [one.radius for one in taken] == [0.01] * (not said)
 
 
 def test_of_a_map_that_is_published_once_the_lines_near_the_vehicle_are_used_wherever_it_flies():
