@@ -332,6 +332,18 @@ def test_brake_meets_state_and_rest():
     np.testing.assert_allclose((*y.v, *y.a), 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("v, within, duration, peak", [
+    ((0.2, 0.0, 0.0), np.inf, 0.4, 0.94), ((2.0, 0.0, 0.0), np.inf, 0.94, 4.0), ((3.0, -4.0, 0.0), np.inf, 2.34, 4.0), ((0.0, 0.0, -3.0), np.inf, 1.41, 4.0),
+    ((3.0, -4.0, 0.0), 1.5, 1.5, 6.25), ((3.0, -4.0, 0.0), 0.1, 1.17, 8.0), ((0.0, 0.0, -3.0), 0.1, 0.70, 8.0), ((2.0, 0.0, 0.0), 3.0, 0.94, 4.0)])
+def test_a_brake_leans_by_22_degrees_in_the_open_and_by_more_only_where_there_is_no_room(v, within, duration, peak):
+    """4 m/s^2; before a surface 8 m/s^2 at most, and then it takes longer than there is time. Velocity falls all the way."""
+    b = brake((0.0, 0.0, 5.0), v, (0.0, 0.0, 0.0), (0, 1, 0), within=within)
+    motion = [b.setpoint(float(t)) for t in np.linspace(0.0, b.duration, 201)]
+    assert b.duration == pytest.approx(duration, abs=0.01) and max(np.linalg.norm(x.a) for x in motion) == pytest.approx(peak, rel=0.01)
+    assert (np.diff([np.linalg.norm(x.v) for x in motion]) < 1e-9).all()
+    np.testing.assert_allclose(np.subtract(motion[-1].p, motion[0].p), 0.5 * b.duration * np.array(v), atol=1e-9)
+
+
 @pytest.mark.parametrize("fault, expected, word", [
     ("fence", State.HOVERING, "geofence"), ("far", State.LANDING, "outside the geofence"), ("tilt", State.RECOVERING, "tilt"),
     ("rate", State.RECOVERING, "body rate"), ("error", State.RECOVERING, "away from the reference"),

@@ -19,8 +19,9 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageSequence
 from unit.recorded_flights import BIAS, PATH, flown, record
 
+from perch_core import so3
 from perch_core.urdf import urdf
-from perch_core.values import NANOSECONDS, AtEnd, ImuSample, OdometryState, TrajectoryOrder
+from perch_core.values import NANOSECONDS, AtEnd, ImuSample, OdometryState, RatesThrust, TrajectoryOrder, rotated
 from perch_core.vehicle import load_vehicle
 from perch_eval import comparison, plots, report
 from perch_eval.camera_clip import clip
@@ -57,6 +58,40 @@ def test_figures_are_what_was_put_in(recorded):
     assert found["max_acceleration_m_s2"] == pytest.approx(planned, rel=0.01)
     assert (found["contact"]["state"], found["contact"]["body"], found["contact"]["normal_speed_m_s"]) == ("attached", "pad", 0.7)
     assert rates(flight)["odometry"] == pytest.approx(500.0) and rates(flight)["rotor_state"] == pytest.approx(100.0)
+
+
+def test_errors_that_were_put_in_are_found_each_under_its_name():
+    """A reference 2 and 3 cm beside the path, an estimate turned by 2 deg and 0.1 m/s too fast, a pad turned by 3 deg."""
+    channels, turn = flown(), so3.quat_exp(np.radians([0.0, 0.0, 2.0]))
+
+    def estimated(state):
+        q = so3.quat_multiply(turn, np.array(state.q_WB))
+        v_W = np.add(rotated(state.q_WB, state.v_B, 1.0), (0.1, 0.0, -0.05))
+        return state._replace(q_WB=tuple(q.tolist()), v_B=rotated(tuple(q.tolist()), tuple(v_W.tolist()), -1.0))
+
+    channels["odometry"] = [(t, estimated(state)) for t, state in channels["odometry"]]
+    channels["controller/reference"] = [(t, x._replace(p=tuple(np.add(x.p, (0.02, 0.0, -0.03)).tolist()))) for t, x in channels["controller/reference"]]
+    [(t, pad)] = channels["target/pose"]
+    channels["target/pose"] = [(t, pad._replace(q_WS=so3.quat_multiply(so3.quat_exp(np.radians([0.0, 0.0, 3.0])), pad.q_WS)))]
+    found = flight_metrics(Flight(channels), 4.0)
+    assert found["tracking_rmse_m"] == pytest.approx([0.02, 0.0, 0.03], abs=1e-9)
+    assert found["velocity_rmse_m_s"] == pytest.approx([0.1, 0.0, 0.05], abs=1e-6)
+    assert found["attitude_error_at_end_deg"] == pytest.approx(2.0, abs=1e-6) and found["estimation_error_at_end_m"] == pytest.approx(BIAS, abs=1e-9)
+    assert found["target_error"] == pytest.approx({"position_m": 0.04, "attitude_deg": 3.0}, abs=1e-6)
+
+
+@pytest.mark.parametrize("channel", ["motor_command", "rates_thrust_command"])
+def test_thrusts_that_are_commanded_and_reached_are_those_of_rotors_or_autopilot(channel):
+    """k Omega^2 of four rotors at 1200 rad/s, or the mass times 9 m/s^2; no thrust while commands have the motors off."""
+    channels, vehicle = flown(), load_vehicle("snapdragon")
+    given = {"motor_command": channels["motor_command"], "rates_thrust_command": timed(
+        RatesThrust(command.stamp, True, (0.0,) * 3, 9.0) for _, command in channels["motor_command"])}[channel]
+    del channels["motor_command"]
+    channels[channel] = [(t, command._replace(armed=t < 3.0)) for t, command in given]
+    t, thrust, commanded = thrust_history(Flight(channels), vehicle)
+    expected = {"motor_command": 4.0 * vehicle.thrust_coefficient * 1200.0**2, "rates_thrust_command": 9.0 * vehicle.mass}[channel]
+    assert len(t) == 300 and thrust == pytest.approx(2.4)
+    assert commanded[t < 2.99] == pytest.approx(expected) and not commanded[t > 3.0].any()
 
 
 def test_rotors_that_are_reported_only_while_they_stand_are_no_thrust_in_flight():
