@@ -106,8 +106,8 @@ def test_reasons_not_to_arm_that_last_are_those_of_repairs_settings_and_restarts
 
 def test_short_and_refused_answers_are_typed_errors():
     for read in (msp.status, msp.battery, msp.attitude, lambda frame: msp.inertial(frame, 512.0)):
-        for frame in (msp.Frame(1, b"\x01", False), msp.Frame(1, bytes(40), True)):
-            with pytest.raises(msp.MspError):
+        for frame, words in ((msp.Frame(1, b"\x01", False), "^MSP 1: 1 bytes, needs "), (msp.Frame(1, bytes(40), True), "^MSP 1: refused$")):
+            with pytest.raises(msp.MspError, match=words):
                 read(frame)
 
 

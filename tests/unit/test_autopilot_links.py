@@ -195,8 +195,9 @@ class Supervised:
 def supervised() -> Iterator[Supervised]:
     one = Supervised()
     yield one
-    one.node.close()
-    one.autopilot.close()
+    for end in (one.node, one.autopilot, one.supervisor._control, one.supervisor._link):
+        if end is not None:
+            end.close()
 
 
 def test_frames_leave_at_200_hz_from_the_first_command_on_whatever_the_rate_of_the_commands(supervised):

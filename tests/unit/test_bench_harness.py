@@ -170,8 +170,9 @@ def test_a_flight_that_never_perches_is_an_error_and_not_endless(monkeypatch):
     loop = SimpleNamespace(time=0.0, close=lambda: None, trace=SimpleNamespace(phases=[(1.0, "tracking", "")]))
     loop.step = lambda: setattr(loop, "time", loop.time + 0.1)
     monkeypatch.setattr(autopilot, "start_flight", lambda: (loop, None, [2.0]))
-    with pytest.raises(KeyError):
+    with pytest.raises(KeyError, match="^'(take_off|searching|planning|verifying|perched)'$"):
         autopilot.phase_times()
+    assert loop.time == pytest.approx(autopilot.PERCH_TIME_MAX, abs=0.15)
 
 
 def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):

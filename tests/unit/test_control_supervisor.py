@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -476,6 +478,17 @@ def leaving(recovery_start: float = 1.6):
 def ready(loop, start: float, planned: float, id: int = 7) -> None:
     order = along_x(planned, 0.4 * (planned - start), 0.4, 0.8, brakes=True)
     loop.controller.keep_ready(Order(id, SampledReference(order, loop.controller.vehicle.mass), planned, AtEnd.HOLD, 0.0, 0.0))
+
+
+def test_a_way_out_that_jumps_inside_is_not_kept():
+    loop, start = leaving()
+    path = along_x(start + 0.6, 0.24, 0.4, 0.8, brakes=True)
+    torn = replace(path, p=path.p + np.where(path.times > 0.4, 0.3, 0.0)[:, None])
+    with pytest.raises(TrajectoryRefused, match="position jumps by 0.5"):
+        loop.controller.keep_ready(Order(7, SampledReference(torn, loop.controller.vehicle.mass), start + 0.6))
+    loop.run(0.1)
+    loop.controller.abort("stop it")
+    assert loop.controller.state is State.HOVERING, "there is no way out"
 
 
 def test_an_abort_does_not_leave_by_a_recovery_that_begins_elsewhere():
