@@ -12,9 +12,10 @@ from perch_control import monitors
 from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_order, check_start
 from perch_control.flight_settings import FlightSettings
 from perch_control.guidance import Blend, Hold, Polynomial, blended, brake, quintic
-from perch_control.maneuvers import following, recovered
+from perch_control.maneuvers import following, hover_after_jump, recovered, stopped
 from perch_control.modes import CommandRefused, State
 from perch_control.odometry_gate import OdometryGate
+from perch_control.recovery import Recovery
 from perch_control.sensor_inputs import SensorInputs
 from perch_control.reference import FlatReference, SampledReference, Setpoint
 from perch_core import so3
@@ -148,6 +149,26 @@ def test_a_recovery_that_ends_at_the_ground_lands(height, end):
     loop.controller.flight_state = recovered(loop.controller.flight_state._replace(ground=0.0), "for a test")
     loop.run(4.0)
     assert loop.controller.state is end, loop.events
+
+
+@pytest.mark.parametrize("tilt, share", [(85.0, 0.95), (60.0, 0.95), (95.0, 0.25), (180.0, 0.25)])
+def test_a_recovery_turns_with_high_thrust_unless_that_would_push_the_vehicle_down(tilt, share):
+    """19 of 20 m/s^2 brake the fall in the second half of the turn; b3 points down in the first. It leads the vehicle by 50 deg."""
+    half = np.radians(tilt) / 2
+    guidance = Recovery(20.0, moved(REST, q=(0.0, np.sin(half), 0.0, np.cos(half))), None)
+    guidance.update(moved(REST, q=(0.0, np.sin(half), 0.0, np.cos(half))), 1.0)
+    f = np.array(guidance.setpoint(0.0).a) + (0.0, 0.0, 9.81)
+    assert np.linalg.norm(f) == pytest.approx(20.0 * share) and not guidance.finished
+    assert np.degrees(np.arccos(f[2] / (20.0 * share))) == pytest.approx(tilt - 50.0, abs=1e-6)
+
+
+def test_a_brake_that_is_ordered_again_is_still_that_of_a_trajectory_that_was_left_early():
+    """No perch begins in it: by a second abort, or by odometry that jumps, it would be forgotten."""
+    loop, _ = leaving()
+    loop.controller.abort("stop it")
+    x = loop.controller.flight_state
+    assert x.left_early and x.mode is State.HOVERING
+    assert stopped(x, "again").left_early and hover_after_jump(x, "odometry has jumped").left_early
 
 
 @pytest.mark.parametrize("inclination", [0.0, 10.0, 20.0, 60.0])

@@ -659,6 +659,19 @@ def test_l1_finds_a_heavier_vehicle_at_the_slowest_rate_that_is_flown():
     assert flight.component.flight.compensator.disturbance[2] == pytest.approx(-0.1 * 9.81 * decayed, rel=0.05)
 
 
+def test_what_the_ground_does_is_taken_for_no_disturbance():
+    """Until it lifts off, the ground carries the vehicle: an upward force that L1 would compensate by less thrust."""
+    flight, found = Flight(params=parameters(adaptive=True)), []
+    flight.step(0.3)
+    flight.order(Command.ARM)
+    flight.follow(flight.path((0, 0, 0), (0, 0, 0.6), 2.0))
+    for _ in range(150):
+        flight.step(0.002)
+        x = flight.component.flight.flight_state
+        found += [np.abs(flight.component.flight.compensator.disturbance).max()] * (x.mode is State.TRACKING and x.at_ground)
+    assert len(found) > 50 and max(found) == 0.0
+
+
 def test_below_the_place_of_the_take_off_a_disturbance_is_air():
     flight = Flight(params=parameters(adaptive=True), disturbances=Disturbances(mass_factor=1.1))
     flight.plant.p, flight.plant.floor = np.array([0.0, 0.0, 1.0]), 1.0
