@@ -28,6 +28,11 @@ def test_bars_are_judged_by_their_statistic():
     assert harness.figure("a", "", [0.0, 0.0], bar=0.0, comparison="max ==").holds is True
     assert harness.figure("a", "", [float("nan")], bar=1.0).holds is False
     assert harness.figure("a", "ms", samples).holds is None
+    skewed = [1.0] * 90 + [5.0] * 9 + [50.0]  # median 1, p99 5.45, max 50, min 1
+    for bar, holding in ((0.5, set()), (2.0, {"median"}), (6.0, {"median", "p99"}), (50.0, {"median", "p99", "max"})):
+        assert {name for name in ("median", "p99", "max") if harness.figure("a", "ms", skewed, bar, f"{name} <=").holds} == holding
+        assert harness.figure("a", "ms", skewed, bar).holds == ("median" in holding), "the median is judged where nothing else is named"
+    assert [harness.figure("a", "", [1.0, 2.0, 9.0], 1.5, f"{name} >=").holds for name in ("min", "median", "max")] == [False, True, True]
 
 
 def test_malformed_figures_are_refused():
@@ -165,8 +170,9 @@ def test_a_flight_that_never_perches_is_an_error_and_not_endless(monkeypatch):
     loop = SimpleNamespace(time=0.0, close=lambda: None, trace=SimpleNamespace(phases=[(1.0, "tracking", "")]))
     loop.step = lambda: setattr(loop, "time", loop.time + 0.1)
     monkeypatch.setattr(autopilot, "start_flight", lambda: (loop, None, [2.0]))
-    with pytest.raises(KeyError):
+    with pytest.raises(KeyError, match="^'(take_off|searching|planning|verifying|perched)'$"):
         autopilot.phase_times()
+    assert loop.time == pytest.approx(autopilot.PERCH_TIME_MAX, abs=0.15)
 
 
 def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):

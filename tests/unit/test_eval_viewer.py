@@ -225,6 +225,9 @@ def test_what_cannot_be_drawn_is_warned_of_and_passed_on(show):
     show.handlers["trajectory"](Serialized("/trajectory", 0, serialize_message(empty), type(empty)))
     assert [line.level for line in said] == ["warning"] and "trajectory is not drawn" in said[0].text
     show.until(lambda: "/trajectory" in show.client.channels, "the topic")
+    show.client.subscribe("/trajectory")
+    show.until(lambda: show.client.of("/trajectory"), "the trajectory")
+    assert deserialize_message(show.client.of("/trajectory")[0][1], Trajectory) == empty
 
 
 def test_a_port_in_use_is_refused_with_what_to_do(served):
