@@ -297,6 +297,15 @@ def test_a_jump_is_a_correction_at_any_speed_but_not_across_a_pause(step, interv
         np.testing.assert_allclose(poses.at(time).corrected, counted * jump, atol=1e-12)
 
 
+@pytest.mark.parametrize("speed, interval, share", [(0.9, 0.02, 0.0), (1.5, 0.02, 0.5), (2.5, 0.02, 1.0), (2.5, 0.06, 0.0)])
+def test_a_small_correction_counts_the_more_the_faster_it_flies_and_not_across_a_gap(speed, interval, share):
+    """By 8 cm, less than what is a jump."""
+    poses, level, velocity = PoseBuffer(), np.array([0.0, 0.0, 0.0, 1.0]), np.array([speed, 0.0, 0.0])
+    for time, correction in ((1.0, 0.0), (1.0 + interval, 0.08)):
+        poses.add(BodyState(time, velocity * time + (0.0, correction, 0.0), level, velocity, np.zeros(3), np.eye(6) * 1e-6))
+    np.testing.assert_allclose(poses.at(poses.newest).corrected, [0.0, 0.08 * share, 0.0], atol=1e-12)
+
+
 @pytest.mark.parametrize("rate, steps", [(500, [0.016] * 25), (150, [0.13] * 3), (30, [0.4 * 0.4 * 0.6**n for n in range(9)]),
                                          (30, [0.13] * 2 + [-0.04] * 2), (30, [0.07] * 3 + [-0.01] * 6)])
 def test_a_jump_that_several_samples_have_counts_in_full_and_a_drift_does_not(rate, steps):
