@@ -180,14 +180,16 @@ def test_time_that_the_host_took_is_read_from_the_kernel(tmp_path, monkeypatch):
 
 
 SPINNING = """
-import machine, multiprocessing, os, signal, time
-signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # as in scripts/bench.py
-with machine.cores_awake():
-    pids = [p.pid for p in multiprocessing.active_children()]
-    while any(os.sched_getscheduler(pid) != os.SCHED_IDLE for pid in pids):  # they are being started
-        time.sleep(0.01)
-    print(*pids, flush=True)
-    time.sleep(60)
+import machine, multiprocessing, os, sys, time
+try:
+    with machine.cores_awake():
+        pids = [p.pid for p in multiprocessing.active_children()]
+        while any(os.sched_getscheduler(pid) != os.SCHED_IDLE for pid in pids):  # they are being started
+            time.sleep(0.01)
+        print(*pids, flush=True)
+        time.sleep(60)
+except KeyboardInterrupt:  # as in scripts/bench.py
+    sys.exit(130)
 """
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import signal
 import subprocess
 import sys
+import tempfile
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -96,7 +98,6 @@ def run_bench(monkeypatch):
     """Runs `bench.py` with words of a command line; `sim` breaks, the other groups call a function."""
     def run_(figures, *arguments: str) -> int:
         monkeypatch.setattr(bench, "enter", lambda: None)
-        monkeypatch.setattr(bench, "leave_quietly_on_interrupt", lambda: None)
         monkeypatch.setattr("importlib.import_module", lambda name: SimpleNamespace(
             figures=(lambda quick: 1 / 0) if name == "sim" else figures, SEEDS=f"of {name}"))
         monkeypatch.setattr(sys, "path", [*sys.path])
@@ -106,11 +107,12 @@ def run_bench(monkeypatch):
     return run_
 
 
-def test_ctrl_c_in_a_benchmark_that_waits_for_nodes_ends_all_of_them(run_bench):
+def test_ctrl_c_ends_all_benchmarks_and_what_one_of_them_has_started_or_written(run_bench, tmp_path):
     def interrupted(quick):
-        raise KeyboardInterrupt
+        with tempfile.TemporaryDirectory(dir=tmp_path):
+            signal.raise_signal(signal.SIGINT)
 
-    assert run_bench(interrupted) == 130
+    assert run_bench(interrupted) == 130 and not [*tmp_path.iterdir()]
 
 
 def test_a_group_that_breaks_hides_no_figures_and_is_named_in_the_file(run_bench, tmp_path, capsys):
