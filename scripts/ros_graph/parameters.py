@@ -131,7 +131,7 @@ def _names(graph: GraphConnection, client: AsyncParameterClient, node: str) -> l
 def _values(graph: GraphConnection, client: AsyncParameterClient, node: str, names: list[str]) -> list[Any]:
     values = list(graph.answer(client.get_parameters(names), node).values)
     if len(values) != len(names):  # the response of a node that lacks one of them
-        raise GraphError(f"{node} does not have {', '.join(names)}; 'param.py list' shows all")
+        raise GraphError(f"{node} does not have {', '.join(names)}; 'param.py list {node}' shows all")
     return values
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+import importlib
 import importlib.util
 import json
 import os
@@ -141,6 +143,14 @@ def test_a_benchmark_whose_file_cannot_be_written_does_not_begin(run_bench, monk
     Path("file").touch()
     assert run_bench(None, "planner", "--json", file) == 2
     assert f"error: --json: {file}: cannot be written: " in capsys.readouterr().err and os.listdir() == ["file"]
+
+
+@pytest.mark.parametrize("script", ["topic", "param", "service", "action"])
+def test_each_sub_command_has_an_example_in_its_help(script):
+    parser = importlib.import_module(script).command_line()
+    verbs = next(action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    for name, command in verbs.items():
+        assert f"python3 scripts/{script}.py {name} " in command.format_help(), name
 
 
 # -- output ----------------------------------------------------------------------------------------------------------
