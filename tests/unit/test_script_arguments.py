@@ -58,6 +58,7 @@ def run(monkeypatch, tmp_path):
 @pytest.mark.parametrize("name, arguments, words", [
     ("start_stack", ("--ready-timeout", "nan"), "--ready-timeout nan is not > 0 s"),
     ("start_stack", ("--ready-timeout", "-1"), "--ready-timeout -1.0 is not > 0 s"),
+    ("fuzz", ("files", "--cases", "file"), "--cases file: cannot be written: Not a directory"),
     ("topic", ("hz", "/imu/data_raw", "--window", "-1"), "-1 is not >= 1"),
     ("topic", ("echo", "/odometry", "-n", "0"), "0 is not >= 1"),
     ("topic", ("pub", "/x", "std_msgs/msg/Empty", "--rate", "0"), "0 is not a number > 0"),
