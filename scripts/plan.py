@@ -45,6 +45,7 @@ def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
         print(f"the verifier refuses it: {finding.requirement} broken by {finding.excess:.3g} at {finding.time:.3f} s", file=sys.stderr)
     if not broken:
         print("the independent verifier finds nothing broken")
+    print("written: " + ", ".join(str(out / name) for name in ("plan.csv", "plan.json", "plan.png")))
     return 3 if broken else 0
 
 
