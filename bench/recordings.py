@@ -305,7 +305,6 @@ def score(arguments: argparse.Namespace) -> int:
         for path in missing:
             repository = "/".join(path.split("/")[:2])
             print(f"{key}: {arguments.folder / path} is missing: git clone https://github.com/{repository} {arguments.folder / repository}")
-        results.pop(key, None)
         if not missing:
             places = [arguments.folder / path for path in recording.paths] or [root() / "tests" / "recordings", arguments.out]
             results[key] = finite(recording.score(*places))

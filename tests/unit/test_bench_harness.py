@@ -154,7 +154,7 @@ def test_a_vehicle_that_is_not_level_when_commands_go_on_or_it_touches_the_wall_
     found = autopilot.stopped(1.0, gap)
     assert found.levelled == math.inf and (found.down == down or math.isnan(found.down) and math.isnan(down))
     for name, value in (("stopped", lambda *_: replace(found, down=math.inf)), ("phase_times", lambda: {"hover": 1.0}), ("levelled", lambda *_: 0.1),
-                        ("held_without_link", lambda: 0.01), ("taken_over", lambda _: 0.01)):
+                        ("held_without_link", lambda: 0.01), ("taken_over", lambda _: 0.01), ("ensure_program", lambda: None)):
         monkeypatch.setattr(autopilot, name, value)
     judged = {one.name: one.holds for one in autopilot.figures(True)}
     assert judged["level within 10 deg"] is judged["descent or motors off"] is False
