@@ -16,7 +16,7 @@ EXAMPLES = """examples:
   python3 scripts/fuzz.py messages --minutes 20          values into every port of every component
   python3 scripts/fuzz.py services --cases /tmp/found    requests to the planners, the mission, the controller
 
-exit code: 0 nothing found, 1 something found, 2 wrong arguments, 130 interrupted"""
+exit code: 0 nothing found, 1 something found, 2 wrong arguments, 130 Ctrl-C"""
 
 
 def main() -> int:

@@ -94,7 +94,7 @@ def main() -> int:
     parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("problem", nargs="?", help="name in config/problems, or a YAML file")
     parser.add_argument("--out", type=Path, default=Path("out/plan"), help="folder for the results (default: %(default)s)")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a setting of the planner")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a setting of the planner; repeatable")
     parser.add_argument("--animation", action="store_true", help="powerline: also write plan.gif")
     parser.add_argument("--list", action="store_true", help="name the problems in config/problems")
     arguments = parser.parse_args()
