@@ -54,6 +54,11 @@ def test_a_powerline_perch_without_recovery_is_not_solved(monkeypatch):
     assert ["perch_ms" not in answer for answer in answers] == [False, False, True]  # starts anywhere: perches alone
 
 
+def test_the_law_that_is_timed_accepts_the_contact_whose_check_is_timed():
+    control = importlib.import_module("control")
+    control._geometric().check_contact(control.FlatReference(control.perch("surface_90_1.7m").trajectory))
+
+
 def test_measure_counts_only_after_the_warm_up():
     calls = []
     times = harness.measure(lambda: calls.append(None), repetitions=7, warm_up=2)
