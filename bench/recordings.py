@@ -288,8 +288,9 @@ def parser() -> argparse.ArgumentParser:
 
 def score(arguments: argparse.Namespace) -> int:
     """Score the available recordings and write the page."""
-    if not arguments.folder.is_dir():
-        raise ConfigError("FOLDER", str(arguments.folder), "is no folder")  # the page would lose every recording
+    there = [path for recording in RECORDINGS.values() for path in recording.paths if (arguments.folder / path).exists()]
+    if not (there or arguments.only and arguments.folder.is_dir()):  # the page would lose every recording
+        raise ConfigError("FOLDER", str(arguments.folder), "is no folder with recordings; --help shows how to clone them")
     signal.signal(signal.SIGINT, signal.default_int_handler)
     data = output_folder(arguments.out) / "results.json"
     single_threaded_blas()

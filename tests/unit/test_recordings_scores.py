@@ -111,6 +111,8 @@ def test_a_recording_that_is_missing_keeps_its_figures_of_the_same_code(bench, m
     assert json.loads((tmp_path / "results.json").read_text())["recordings"] == written["recordings"]
 
 
-def test_a_folder_that_does_not_exist_does_not_replace_the_page(bench, tmp_path, capsys):
-    assert bench.main([str(tmp_path / "typo"), "--out", str(tmp_path / "out")]) == 2
-    assert "typo: is no folder" in capsys.readouterr().err and not (tmp_path / "out").exists()
+@pytest.mark.parametrize("words", [("typo",), ("typo", "--only", "floor"), (".",)])
+def test_a_folder_without_recordings_does_not_replace_the_page(bench, monkeypatch, tmp_path, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    assert bench.main([*words, "--out", "out"]) == 2
+    assert f"FOLDER: {words[0]}: is no folder with recordings; --help shows how" in capsys.readouterr().err and not Path("out").exists()
