@@ -29,7 +29,7 @@ def show_info(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     print(f"Type: {', '.join(topic_types(graph, topic, arguments.spin_time))}\n")
     for side, endpoints in sides.items():
         print(f"{side} count: {len(endpoints)}")
-        if arguments.verbose:
+        if arguments.verbose and endpoints:
             print("\n" + "\n".join(endpoints) + "\n")
     return 0
 
