@@ -123,7 +123,7 @@ def plan_file(arguments: argparse.Namespace) -> int:
     mapping |= {key: config.beside(path, mapping[key]) for key in {"vehicle"} & set(mapping)}
     _apply(mapping, arguments.set)
     if arguments.animation and kind != "powerline":
-        raise ConfigError("--animation", kind, "only for powerline")
+        raise ConfigError("--animation", arguments.problem, "only problems of kind powerline are animated")
     source = " ".join([str(path), *(f"--set {change}" for change in arguments.set)])
     try:
         return KINDS[kind](mapping, source, arguments.out, arguments.animation)
