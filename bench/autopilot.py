@@ -3,7 +3,7 @@
 A perch on `surface_90` (modelled VIO and tags) is flown through the firmware. Commands go to the process that holds the link
 (`LinkSupervisor`) and from there over MSP to the firmware, whose self-level mode levels the simulated body. They stop for 50 ms
 to 5 s, or for good: the node is killed or hangs. In further runs, a body in free air, without a wall, starts tilted and rotating.
-Times are relative to the last command that reached the supervisor. Requires the firmware (`python3 scripts/betaflight.py build`).
+Times are relative to the last command that reached the supervisor. The firmware is built on first use.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from closed_loop.supervised_loop import Body, SupervisedLoop
 from harness import Figure, figure
 
+from perch_autopilot.firmware import ensure_program
 from perch_autopilot.watchdog import OFF, Mode
 from perch_core.vehicle import load_vehicle
 from perch_eval.goal import goal_of
@@ -165,6 +166,7 @@ def taken_over(at: float) -> float:
 
 def figures(quick: bool) -> list[Figure]:
     """Measure every phase with every gap; `quick`: only with the node killed."""
+    ensure_program()
     found, out = {}, []
     print(f"{'phase':16s} {'stop':>8s} {'tilt':>5s} {'max':>5s} {'sent':>6s} {'level':>6s} {'down':>6s} {'held':>6s}   [deg], [s]")
     for name, at in (when := phase_times()).items():

@@ -18,21 +18,14 @@ from perch_control.geometric import GeometricController
 from perch_control.nmpc import LineWeights, NmpcController, NmpcSettings
 from perch_control.reference import FlatReference
 from perch_control.rotor_lag import RotorEstimate
-from perch_core.vehicle import ControlGains, load_vehicle
+from perch_core.vehicle import Vehicle, load_vehicle
 
 SEEDS = "none: nothing is random"
 VEHICLE = load_vehicle("snapdragon")
 
 
-def _geometric() -> GeometricController:
-    return GeometricController(VEHICLE, ControlGains())
-
-
-def _nmpc(thrust_states: bool = False, lines: bool = False) -> NmpcController:
-    if lines:
-        vehicle, weights = load_vehicle("rpg"), LineWeights(perception=1500.0, visibility=200.0, collision=2000.0)
-        return NmpcController(vehicle, NmpcSettings(lines=weights), GeometricController(vehicle, ControlGains()))
-    return NmpcController(VEHICLE, NmpcSettings(), _geometric(), thrust_states)
+def _geometric(vehicle: Vehicle = VEHICLE) -> GeometricController:
+    return GeometricController(vehicle, vehicle.gains)
 
 
 def _timed(law) -> tuple[list[float], list[float]]:
@@ -62,17 +55,18 @@ def figures(quick: bool) -> list[Figure]:
     check = measure(lambda: law.check_contact(source), repetitions=5 if quick else 50)
     out = [figure("geometric step", "us", 1e6 * step, bar=10.0), figure("check of a contact trajectory", "ms", 1e3 * check)]
     for states, bars in ((13, ((0.3, "median <="), (0.6, "p99 <="))), (17, ((1.5, "p99 <="),))):
-        law = _nmpc(states == 17)
+        law = NmpcController(VEHICLE, NmpcSettings(), _geometric(), thrust_states=states == 17)
         used, passed = _timed(law)
         for _ in range(1 if quick else 2):
             fly_to_contact(perch("surface_90_1.7m"), law=law)
         for bar, comparison in bars:
             out.append(figure(f"nmpc step, {states} states, {comparison.split()[0]}", "ms", 1e3 * np.array(used), bar, comparison))
         out.append(figure(f"nmpc step, {states} states, by the clock", "ms", 1e3 * np.array(passed)))
-    law = _nmpc(lines=True)
+    vehicle, weights = load_vehicle("rpg"), LineWeights(perception=1500.0, visibility=200.0, collision=2000.0)
+    law = NmpcController(vehicle, NmpcSettings(lines=weights), _geometric(vehicle))
     law.lines(tuple((x, 0.0, 1.5, 0.0, 1.0, 0.0, 4.0, 0.03) for x in (4.0, 5.0, 6.0)))
     used, _ = _timed(law)
-    loop = make_loop(vehicle=law.vehicle, law=law)
+    loop = make_loop(vehicle=vehicle, law=law)
     loop.begin_in_hover()
     loop.run(2.0)
     return [*out, figure("nmpc step with three lines, 13 states", "ms", 1e3 * np.array(used))]

@@ -288,8 +288,9 @@ def parser() -> argparse.ArgumentParser:
 
 def score(arguments: argparse.Namespace) -> int:
     """Score the available recordings and write the page."""
-    if not arguments.folder.is_dir():
-        raise ConfigError("FOLDER", str(arguments.folder), "is no folder")  # the page would lose every recording
+    there = [path for recording in RECORDINGS.values() for path in recording.paths if (arguments.folder / path).exists()]
+    if not (there or arguments.only and arguments.folder.is_dir()):  # the page would lose every recording
+        raise ConfigError("FOLDER", str(arguments.folder), "is no folder with recordings; --help shows how to clone them")
     signal.signal(signal.SIGINT, signal.default_int_handler)
     data = output_folder(arguments.out) / "results.json"
     single_threaded_blas()
@@ -305,7 +306,6 @@ def score(arguments: argparse.Namespace) -> int:
         for path in missing:
             repository = "/".join(path.split("/")[:2])
             print(f"{key}: {arguments.folder / path} is missing: git clone https://github.com/{repository} {arguments.folder / repository}")
-        results.pop(key, None)
         if not missing:
             places = [arguments.folder / path for path in recording.paths] or [root() / "tests" / "recordings", arguments.out]
             results[key] = finite(recording.score(*places))

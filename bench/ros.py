@@ -95,7 +95,8 @@ class Probe(GraphNode):
         climb = rest_to_rest(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 2.0, start_time=seconds(begin))
         self.order("trajectory", TrajectoryOrder(1, climb))
         self.spin_for(4.0)
-        assert self.diagnostics["controller"]["state"] == "HOVERING", self.diagnostics["controller"]
+        if (state := self.diagnostics.get("controller", {}).get("state")) != "HOVERING":
+            raise PerchError(f"the controller is {state} after the take-off, not HOVERING")
 
     def close(self) -> None:
         """Leave the graph."""
@@ -130,8 +131,11 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
         probe.take_off()
         counts_of = (("vehicle", "deadlines_missed", "steps"), ("vehicle", "commands_missed", "steps"),
                      ("estimator", "missed_deadlines", "deadlines"), ("controller", "missed_deadlines", "deadlines"))
-        before = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
-        delays = []
+
+        def counted() -> list[tuple[int, int]]:
+            return [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
+
+        before, delays = counted(), []
         rates, wake_ups, host, used = {channel: [] for channel in RATES}, LateWakeUps(), StolenTime(), processor_time(stack)
         for _ in range(windows):
             counts = dict(probe.counts)
@@ -140,7 +144,7 @@ def real_time(scenario: Scenario, folder: Path, windows: int, law: str = "geomet
             for channel in RATES:
                 rates[channel].append((probe.counts[channel] - counts[channel]) / span)
         late, stolen, used = wake_ups.share(), host.share(), processor_time(stack) - used
-        after = [(probe.count(node, part), probe.count(node, whole)) for node, part, whole in counts_of]
+        after = counted()
         load = used / max(1, after[0][1] - before[0][1])
     out = [figure(f"{where}: rate of {channel}", "Hz", samples, bar=499.0 if composed else None, comparison="median >=")
            for channel, samples in rates.items()]

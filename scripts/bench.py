@@ -9,7 +9,7 @@ import sys
 from contextlib import nullcontext
 from pathlib import Path
 
-from perch_setup import ROOT, command_parser, enter, leave_quietly_on_interrupt
+from perch_setup import ROOT, command_parser, enter, quiet_on_interrupt
 
 GROUPS = ("planner", "perception", "control", "powerline", "sim", "autopilot", "ros")
 EXAMPLES = """examples:
@@ -29,8 +29,8 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="fewer repetitions: the figures are rougher")
     parser.parse_args()
     enter()
-    leave_quietly_on_interrupt()
-    from perch_eval.arguments import command
+    with quiet_on_interrupt():
+        from perch_eval.arguments import command
 
     return command(lambda: parser, measure)()
 
@@ -39,9 +39,10 @@ def measure(arguments: argparse.Namespace) -> int:
     """Run the groups, print their tables, write the JSON."""
     sys.path.insert(0, str(ROOT / "bench"))
     sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "oracles")]  # the closed loop and the oracles of the tests
-    import harness
-    from perch_core.json_values import write_json
-    from perch_eval.arguments import output_file
+    with quiet_on_interrupt():
+        import harness
+        from perch_core.json_values import write_json
+        from perch_eval.arguments import output_file
 
     results, seeds, errors = {}, {}, {}
     with output_file(arguments.json, "--json") if arguments.json else nullcontext() as draft:
@@ -49,7 +50,8 @@ def measure(arguments: argparse.Namespace) -> int:
         for group in [arguments.group] if arguments.group else GROUPS:
             print(f"== {group}", flush=True)
             try:
-                module = importlib.import_module(group)  # bench/<group>.py
+                with quiet_on_interrupt():
+                    module = importlib.import_module(group)  # bench/<group>.py
                 results[group], seeds[group] = module.figures(arguments.quick), module.SEEDS
             except Exception as error:  # a group that breaks must not hide the figures of the others
                 errors[group] = f"{type(error).__name__}: {error}"

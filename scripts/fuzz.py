@@ -16,7 +16,7 @@ EXAMPLES = """examples:
   python3 scripts/fuzz.py messages --minutes 20          values into every port of every component
   python3 scripts/fuzz.py services --cases /tmp/found    requests to the planners, the mission, the controller
 
-exit code: 0 nothing found, 1 something found, 2 wrong arguments, 130 interrupted"""
+exit code: 0 nothing found, 1 something found, 2 wrong arguments, 130 Ctrl-C"""
 
 
 def main() -> int:
@@ -31,6 +31,10 @@ def main() -> int:
     arguments = parser.parse_args()
     if not 0.0 < arguments.minutes <= 1e5:
         parser.error(f"--minutes {arguments.minutes} is outside (0, 100000]")
+    try:
+        (arguments.cases / arguments.kind).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--cases {arguments.cases}: cannot be written: {error.strerror}")
     enter()
     sys.path.append(str(ROOT / "tests"))
     with quiet_on_interrupt():
@@ -38,14 +42,14 @@ def main() -> int:
 
         fuzzer = importlib.import_module(f"fuzzing.{arguments.kind}")
     report = Report(arguments.kind, arguments.minutes, arguments.cases)
-    code = 0
     try:
         fuzzer.run(arguments.minutes, arguments.seed, report)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        code = INTERRUPTED
-    print(f"{report.line().strip()}; {len(report.problems)} problems")
-    return code or (1 if report.problems else 0)
+        return INTERRUPTED
+    finally:
+        print(f"{report.line().strip()}; {len(report.problems)} problems")
+    return 1 if report.problems else 0
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ def command_line() -> argparse.ArgumentParser:
     describe = commands.add("describe", "parameters:describe_parameters", "unit, range and meaning, of some parameters or of all")
     for command, how_many in ((get, None), (change, None), (describe, "*")):
         command.add_argument("node")
-        command.add_argument("parameter", nargs=how_many)
+        command.add_argument("parameter", nargs=how_many, help="as in gains.position")
     change.add_argument("value", help="in YAML")
     commands.add("dump", "parameters:dump_parameters", "all values as a parameter file").add_argument("node")
     return commands.parser

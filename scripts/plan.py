@@ -45,6 +45,7 @@ def _plan_perch(mapping: dict, source: str, out: Path, animation: bool) -> int:
         print(f"the verifier refuses it: {finding.requirement} broken by {finding.excess:.3g} at {finding.time:.3f} s", file=sys.stderr)
     if not broken:
         print("the independent verifier finds nothing broken")
+    print("written: " + ", ".join(str(out / name) for name in ("plan.csv", "plan.json", "plan.png")))
     return 3 if broken else 0
 
 
@@ -93,7 +94,7 @@ def main() -> int:
     parser = command_parser(__doc__, EXAMPLES)
     parser.add_argument("problem", nargs="?", help="name in config/problems, or a YAML file")
     parser.add_argument("--out", type=Path, default=Path("out/plan"), help="folder for the results (default: %(default)s)")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a setting of the planner")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="replace a setting of the planner; repeatable")
     parser.add_argument("--animation", action="store_true", help="powerline: also write plan.gif")
     parser.add_argument("--list", action="store_true", help="name the problems in config/problems")
     arguments = parser.parse_args()
@@ -122,7 +123,7 @@ def plan_file(arguments: argparse.Namespace) -> int:
     mapping |= {key: config.beside(path, mapping[key]) for key in {"vehicle"} & set(mapping)}
     _apply(mapping, arguments.set)
     if arguments.animation and kind != "powerline":
-        raise ConfigError("--animation", kind, "only for powerline")
+        raise ConfigError("--animation", arguments.problem, "only problems of kind powerline are animated")
     source = " ".join([str(path), *(f"--set {change}" for change in arguments.set)])
     try:
         return KINDS[kind](mapping, source, arguments.out, arguments.animation)

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Start every node of a scenario as its own process, and stop them all on Ctrl-C.
+"""Start the nodes of a scenario, each in a process of its own unless --composed, and stop them all on Ctrl-C.
 
 The nodes' output appears with the node's name in front; it is also kept, with the parameters, in the log folder.
 """
@@ -47,9 +47,10 @@ def command_line() -> argparse.ArgumentParser:
     parser.add_argument("--domain", type=int, metavar="N", help="ROS domain id, 0 to 101 (default: $ROS_DOMAIN_ID)")
     parser.add_argument("--network", metavar="ADDRESS", help="open the ROS graph to the network in which this machine has this address (SECURITY.md)")
     parser.add_argument("--namespace", default="", metavar="NS", help="namespace of every node, as in /quad1")
-    parser.add_argument("--log-dir", type=Path, metavar="DIR", help="logs and parameters (default: out/stack/<time>-<process>)")
+    parser.add_argument("--log-dir", type=Path, metavar="DIR", help="folder of logs and parameters (default: out/stack/<time>-<process>)")
     parser.add_argument("--ready-timeout", type=float, default=180.0, metavar="S", help="how long nodes may take to come up (default: %(default)g s)")
-    parser.add_argument("-p", "--parameter", action="append", default=[], metavar="NODE.PARAM:=VALUE", help="over every file; repeatable")
+    parser.add_argument("-p", "--parameter", action="append", default=[], metavar="NODE.PARAM:=VALUE",
+                        help="set a parameter, whatever the files say; repeatable")
     return parser
 
 

@@ -41,11 +41,12 @@ EXAMPLES = """examples:
   python3 scripts/test.py --fast                 without tests/system, which fly whole stacks
   python3 scripts/test.py tests/unit -k camera   some tests
   python3 scripts/test.py -x --lf                any option of pytest
-"""
+
+exit code: 0 all passed, 1 some failed, 2 wrong arguments, 130 Ctrl-C"""
 
 
 def main() -> int:
-    """Run pytest; 0 all passed, 1 some failed, 2 wrong arguments, 130 Ctrl-C."""
+    """Run pytest; return the exit code."""
     parser = command_parser(__doc__, EXAMPLES, allow_abbrev=False)
     parser.add_argument("--quick", action="store_true", help="only the unit tests that fly, draw and start nothing")
     parser.add_argument("--fast", action="store_true", help="skip tests/system")
@@ -76,7 +77,7 @@ def run_tests(quick: bool, fast: bool, for_pytest: list[str]) -> int:
 
 
 def run_pytest(arguments: list[str], *plugins: object) -> int:
-    """Run pytest in this process; return the exit code as in `main`."""
+    """Run pytest in this process; return the exit code that the help names."""
     import pytest
 
     interrupts = InterruptPlugin()

@@ -14,6 +14,7 @@ EXAMPLES = """examples:
   python3 scripts/topic.py echo /camera_front/image_raw --once --no-arr
   python3 scripts/topic.py hz /imu/data_raw --window 500
   python3 scripts/topic.py info /trajectory -v
+  python3 scripts/topic.py pub --once /controller/command perch_msgs/msg/ControllerCommand '{command: 2, reason: by hand}'
 """
 
 
@@ -34,15 +35,15 @@ def command_line() -> argparse.ArgumentParser:
 
     rate = commands.add("hz", "topics:measure_rate", "measure the rate")
     _add_topic(rate)
-    rate.add_argument("-w", "--window", type=count, default=10_000, metavar="N", help="messages to average over")
+    rate.add_argument("-w", "--window", type=count, default=10_000, metavar="N", help="messages to average over (default: %(default)s)")
     rate.add_argument("-n", type=count, metavar="N", help="end after N messages")
 
-    publish = commands.add("pub", "topics:publish", "publish a message")
+    publish = commands.add("pub", "topics:publish", "publish a message, repeatedly until Ctrl-C")
     publish.add_argument("topic")
-    publish.add_argument("type")
+    publish.add_argument("type", help="as in std_msgs/msg/Float64")
     publish.add_argument("values", nargs="?", default="", help="fields in YAML, as in '{data: 1.0}'")
-    publish.add_argument("-r", "--rate", type=positive, default=1.0, metavar="HZ")
-    publish.add_argument("-1", "--once", action="store_true")
+    publish.add_argument("-r", "--rate", type=positive, default=1.0, metavar="HZ", help="messages per second (default: %(default)g)")
+    publish.add_argument("-1", "--once", action="store_true", help="publish it once, when there is a subscriber")
 
     return commands.parser
 

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from .environment import variables
 from .errors import FAILED, SetupError
@@ -78,15 +78,15 @@ def run(module: str, *extras: str) -> NoReturn:
     sys.exit(main())
 
 
-def leave_quietly_on_interrupt() -> None:
-    """Let Ctrl-C end a script without a traceback, also outside our own code."""
-    signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+def leave_quietly_on_interrupt() -> Any:
+    """Let Ctrl-C end a script without a traceback, also outside our own code; return what handled it before."""
+    return signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
 
 
 @contextmanager
 def quiet_on_interrupt() -> Iterator[None]:
     """Let Ctrl-C end the script without a traceback in this context; for imports, which take seconds."""
-    before = signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))
+    before = leave_quietly_on_interrupt()
     try:
         yield
     finally:

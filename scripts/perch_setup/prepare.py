@@ -127,7 +127,7 @@ def _compiled(target: Platform, done: dict[str, str]) -> Iterator[None]:
                 if code:
                     raise SetupError(f"{WARM_UP} flight: exit code {code}")
             except SetupError as error:
-                print(f"perch set-up: left to the first flight ({error})", file=sys.stderr)
+                print(f"perch set-up: compiling is left to the first flight ({error})", file=sys.stderr)
         finally:
             flight.kill()
     done["warmed"] = stamp

@@ -35,6 +35,7 @@ class Commands:
     """
 
     def __init__(self, description: str | None, examples: str) -> None:
+        self._examples = examples
         self.parser = command_parser(description or "", examples, allow_abbrev=False)
         self._verbs = self.parser.add_subparsers(required=True)
 
@@ -44,11 +45,13 @@ class Commands:
         Args:
             name: on the command line.
             handler: `module:function` in this package, imported inside the environment only; takes `GraphConnection` and arguments.
-            about: its help text.
+            about: its help text; examples in its own help are those of the script that call it.
         """
-        command = self._verbs.add_parser(name, help=about)
+        own = "\n".join(line for line in self._examples.splitlines() if f".py {name} " in line)
+        command = self._verbs.add_parser(name, help=about, description=about, epilog=f"examples:\n{own}",
+                                         formatter_class=argparse.RawDescriptionHelpFormatter)
         command.set_defaults(handler=handler)
-        command.add_argument("--spin-time", type=positive, default=5.0, metavar="S", help="wait at most so long for discovery [s] (default: 5)")
+        command.add_argument("--spin-time", type=positive, default=5.0, metavar="S", help="wait at most this long for discovery [s] (default: %(default)g)")
         self._verbs.metavar = "|".join(self._verbs.choices)
         return command
 
@@ -56,7 +59,7 @@ class Commands:
         """Add the sub-command `list`, of `topics`, `services` or `actions`."""
         command = self.add("list", "connection:list_names", f"the {kind} of the graph")
         command.set_defaults(kind=kind)
-        command.add_argument("-t", "--show-types", action="store_true")
+        command.add_argument("-t", "--show-types", action="store_true", help="with their types")
 
 
 def count(text: str) -> int:

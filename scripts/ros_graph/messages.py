@@ -34,7 +34,7 @@ def interface(name: str, kind: str) -> type:
     parts = name.split("/")
     if len(parts) == 2:
         parts.insert(1, kind)
-    if len(parts) != 3 or parts[1] != kind or not all(parts):
+    if len(parts) != 3 or parts[1] != kind or not all(parts) or parts[2].startswith("_"):  # which are modules
         raise GraphError(f"type {name!r}: expected PACKAGE/{kind}/NAME")
     package, _, last = parts
     try:

@@ -120,7 +120,8 @@ def _nodes(graph: GraphConnection, timeout: float) -> list[str]:
 def _client(graph: GraphConnection, node: str, timeout: float) -> AsyncParameterClient:
     client = AsyncParameterClient(graph.node, node)
     if not graph.spin_until(client.services_are_ready, timeout):
-        raise GraphError(f"node {node} does not exist or has no parameters; nodes that have: {', '.join(_nodes(graph, 1.0)) or 'none'}")
+        others = [name for name in _nodes(graph, 1.0) if name != node]  # our client gives it the names of services that it lacks
+        raise GraphError(f"node {node} does not exist or has no parameters; nodes that have: {', '.join(others) or 'none'}")
     return client
 
 
@@ -131,7 +132,8 @@ def _names(graph: GraphConnection, client: AsyncParameterClient, node: str) -> l
 def _values(graph: GraphConnection, client: AsyncParameterClient, node: str, names: list[str]) -> list[Any]:
     values = list(graph.answer(client.get_parameters(names), node).values)
     if len(values) != len(names):  # the response of a node that lacks one of them
-        raise GraphError(f"{node} does not have {', '.join(names)}; 'param.py list' shows all")
+        missing = sorted(set(names) - set(_names(graph, client, node)))
+        raise GraphError(f"{node} does not have {', '.join(missing)}; 'param.py list {node}' shows all")
     return values
 
 

@@ -24,12 +24,12 @@ REPORT_PERIOD = 1.0  # of `hz` [s]
 def show_info(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     """Run `topic.py info`."""
     topic = graph.absolute(arguments.topic)
-    name = topic_type(graph, topic, arguments.spin_time)
+    topic_types(graph, topic, arguments.spin_time)  # there are some
     sides = graph.settle(lambda: _sides(graph, topic), arguments.spin_time)
-    print(f"Type: {name}\n")
+    print(f"Type: {', '.join(topic_types(graph, topic, arguments.spin_time))}\n")
     for side, endpoints in sides.items():
         print(f"{side} count: {len(endpoints)}")
-        if arguments.verbose:
+        if arguments.verbose and endpoints:
             print("\n" + "\n".join(endpoints) + "\n")
     return 0
 
@@ -114,26 +114,26 @@ def publish(graph: GraphConnection, arguments: argparse.Namespace) -> int:
     return 0
 
 
-def topic_type(graph: GraphConnection, topic: str, timeout: float) -> str:
-    """Return the name of a topic's type, as soon as the topic exists in the graph.
+def topic_types(graph: GraphConnection, topic: str, timeout: float) -> Sequence[str]:
+    """Return the names of a topic's types, as soon as the topic exists in the graph.
 
     Raises:
-        GraphError: the topic does not appear in time, or has several types.
+        GraphError: the topic does not appear in time.
     """
-    absolute = graph.absolute(topic)
-    types = graph.spin_until(lambda: dict(graph.node.get_topic_names_and_types()).get(absolute), timeout)
+    types = graph.spin_until(lambda: dict(graph.node.get_topic_names_and_types()).get(topic), timeout)
     if not types:
         domain = graph.node.context.get_domain_id()
-        raise GraphError(f"topic {absolute} does not exist in ROS domain {domain}; 'topic.py list' shows what does")
-    if len(types) > 1:
-        raise GraphError(f"topic {absolute} has several types: {', '.join(types)}; name one")
-    return types[0]
+        raise GraphError(f"topic {topic} does not exist in ROS domain {domain}; 'topic.py list' shows what does")
+    return types
 
 
 def _subscribe(graph: GraphConnection, arguments: argparse.Namespace, callback: Callable[[Any], None], raw: bool = False) -> None:
     """Subscribe to the topic of the command line with QoS compatible with its publishers; its type is given or from the graph."""
-    cls = interface(arguments.type or topic_type(graph, arguments.topic, arguments.spin_time), "msg")
     topic = graph.absolute(arguments.topic)
+    types = [arguments.type] if arguments.type else topic_types(graph, topic, arguments.spin_time)
+    if len(types) > 1:
+        raise GraphError(f"topic {topic} has several types: {', '.join(types)}; name one after the topic")
+    cls = interface(types[0], "msg")
     publishers = graph.spin_until(lambda: graph.node.get_publishers_info_by_topic(topic), arguments.spin_time)
     profiles = [endpoint.qos_profile for endpoint in publishers]
     profile = QoSProfile(depth=10)

@@ -41,7 +41,7 @@ def test_maximum_is_enclosed_and_attained(seed):
 
 @given(seeds, st.floats(0.5, 1.5))
 @settings(max_examples=60)
-def test_a_floor_saves_work_but_leaves_the_bound_proved(seed, share):
+def test_a_floor_leaves_the_bound_proved(seed, share):
     poly = thrust_like(seed)
     dense = bernstein.evaluate(poly, np.linspace(0.0, 1.0, 2001)).max()
     tolerance = 1e-6 * np.abs(poly).max()
@@ -49,6 +49,18 @@ def test_a_floor_saves_work_but_leaves_the_bound_proved(seed, share):
     assert proved >= dense
     assert proved <= max(attained, share * dense) + 2.0 * tolerance
     assert attained <= dense * (1.0 + 1e-4)
+
+
+def test_a_floor_saves_work(monkeypatch):
+    """The higher it is, the fewer halvings the plain function takes; none where it is above all coefficients."""
+    halvings, split, counts = [], bounds.split, []
+    monkeypatch.setattr(bounds, "split", lambda *halves: halvings.append(halves) or split(*halves))
+    for floor in (-np.inf, 0.05, 0.3):
+        halvings.clear()
+        _, proved, _ = getattr(bounds.maximum, "py_func", bounds.maximum)(np.array([-0.09, 0.21, -0.49]), 1e-9, floor)  # -(s - 0.3)^2
+        assert 0.0 <= proved <= max(floor, 0.0) + 2e-9
+        counts.append(len(halvings))
+    assert counts[0] > counts[1] > counts[2] == 0
 
 
 @given(seeds)

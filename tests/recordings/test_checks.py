@@ -1,6 +1,7 @@
 """`scripts/sensors.py check`: what would make perception fail is named, and what is well is not."""
 
 import itertools
+import re
 from types import SimpleNamespace
 
 import cv2
@@ -156,10 +157,16 @@ def test_a_rate_as_recommended_is_well_whatever_the_clocks(rate, level):
     assert report.findings[0].level == level
 
 
-def test_the_command_says_it_by_its_exit_code(files, capsys):
+def test_the_command_says_it_by_its_exit_code(files, tmp_path, capsys):
     assert sensors_command.main(["check", str(files / "mcap"), "--sensors", str(files / "mine.yaml")]) == 0
     told = capsys.readouterr().out
-    assert "rest" in told and "gyro noise" in told and "warning" not in told
+    assert "rest" in told and "gyro noise" in told and "warning" not in told and "fails" not in told
+    (tmp_path / "cam0" / "data").mkdir(parents=True)
+    (tmp_path / "cam0" / "data.csv").write_text("".join(f"{10**9 + 10**8 * k},{k}.png\n" for k in range(12)))
+    for k in range(12):
+        cv2.imwrite(str(tmp_path / "cam0" / "data" / f"{k}.png"), np.full((48, 64), 128, np.uint8))
+    assert sensors_command.main(["check", str(tmp_path)]) == 1
+    assert re.search(r"^fails +camera cam0 texture ", capsys.readouterr().out, re.MULTILINE)
     assert sensors_command.main(["check", str(files / "none")]) == 2
 
 

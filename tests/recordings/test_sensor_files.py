@@ -1,5 +1,6 @@
 """Sensor files: imported from Kalibr and EuRoC without loss, strict, read by the nodes' components and by nothing of the simulator."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,6 +40,12 @@ def test_without_a_file_the_filters_know_what_the_first_vehicles_file_says():
         assert calibration_sigmas("snapdragon", camera, CalibrationSigmas(focal=0.04)) == CalibrationSigmas()
 
 
+def check_imu(imu, topic):
+    """Each figure is in its own place."""
+    assert (imu.rate, imu.topic, imu.gyro_noise_density, imu.accel_noise_density, imu.gyro_bias_walk, imu.accel_bias_walk) == (
+        photo_flight.IMU_RATE, topic, photo_flight.GYRO_DENSITY, photo_flight.ACCEL_DENSITY, 1e-5, 1e-3)
+
+
 def test_kalibr_says_the_same(tmp_path):
     sensors = from_kalibr(*photo_flight.kalibr(tmp_path), "mine")
     mount = sensors.mounts["cam0"]
@@ -46,6 +53,7 @@ def test_kalibr_says_the_same(tmp_path):
     np.testing.assert_allclose(mount.R_BC, photo_flight.R_BC.as_matrix(), atol=1e-7)
     assert mount.stamp_offset == pytest.approx(photo_flight.STAMP_OFFSET) and sensors.cameras["cam0"].topic == "/cam0/image_raw"
     assert sensors.imu.gyro_noise == pytest.approx(photo_flight.GYRO_DENSITY * np.sqrt(200.0))
+    check_imu(sensors.imu, "/imu0")
     points = np.random.default_rng(1).uniform([-0.6, -0.4, 1.0], [0.6, 0.4, 2.0], (50, 3))
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), photo_flight.K, photo_flight.DISTORTION)[0][:, 0]
     np.testing.assert_allclose(mount.camera.project(points)[0], expected, atol=1e-6)
@@ -103,8 +111,25 @@ def test_fisheye_of_kalibr(tmp_path):
 def test_euroc_says_the_same(files):
     sensors = from_asl(files / "asl" / "mav0")
     np.testing.assert_allclose(sensors.mounts["cam0"].R_BC, photo_flight.R_BC.as_matrix(), atol=1e-7)
-    assert sensors.cameras["cam0"].rate == photo_flight.IMAGE_RATE and sensors.imu.rate == photo_flight.IMU_RATE
-    assert sensors.imu.accel_noise_density == photo_flight.ACCEL_DENSITY
+    np.testing.assert_allclose(sensors.mounts["cam0"].p_BC, photo_flight.P_BC, atol=1e-9)
+    assert sensors.cameras["cam0"].rate == photo_flight.IMAGE_RATE
+    assert sensors.mounts["cam0"].camera == load_sensors(files / "mine.yaml").mounts["cam0"].camera, "as by Kalibr"
+    check_imu(sensors.imu, "")
+
+
+def test_the_body_of_euroc_is_the_imu_wherever_it_is_in_that_of_the_data_set(files, tmp_path):
+    """`T_BS` of the camera is in the data set's body, which may be another one than the IMU."""
+    T, plain = np.eye(4), from_asl(files / "asl" / "mav0")
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", [100.0, 20.0, -40.0], degrees=True).as_matrix(), (0.07, -0.03, -0.12)
+    for name in ("imu0", "cam0"):
+        file = tmp_path / "mav0" / name / "sensor.yaml"
+        file.parent.mkdir(parents=True)
+        text = (files / "asl" / "mav0" / name / "sensor.yaml").read_text()
+        there = T @ (np.eye(4) if name == "imu0" else np.block([[photo_flight.R_BC.as_matrix(), photo_flight.P_BC[:, None]], [np.eye(4)[3:]]]))
+        file.write_text(re.sub(r"data: \[.*\]", lambda _: f"data: {there.ravel().tolist()}", text, count=1))
+    moved = from_asl(tmp_path / "mav0")
+    np.testing.assert_allclose(moved.mounts["cam0"].R_BC, plain.mounts["cam0"].R_BC, atol=1e-9)
+    np.testing.assert_allclose(moved.mounts["cam0"].p_BC, plain.mounts["cam0"].p_BC, atol=1e-9)
 
 
 def test_what_is_written_can_be_read_again(files, tmp_path):

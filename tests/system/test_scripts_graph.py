@@ -99,12 +99,16 @@ def test_parameters(run):
     assert yaml.safe_load(run("param.py", "dump", "/peer").stdout)["/peer"]["ros__parameters"]["gain"] == 3.0
     unknown = run("param.py", "get", "/peer", "gian")
     assert unknown.returncode == 2 and "gian" in unknown.stderr
+    unknown = run("param.py", "describe", "/peer", "gain", "gian")
+    assert (unknown.returncode, unknown.stderr) == (2, "error: /peer does not have gian; 'param.py list /peer' shows all\n")
     run("param.py", "set", "/peer", "gain", "2.0")
 
 
-def test_a_node_that_does_not_exist(peer):
-    result = fork_script("param.py", "get", "/ghost", "gain", "--spin-time", "1", **peer)
-    assert result.returncode == 2 and "node /ghost does not exist" in result.stderr
+@pytest.mark.parametrize("node", ["/ghost", "/bare"])
+def test_a_node_that_does_not_exist_or_has_no_parameters(peer, node):
+    result = fork_script("param.py", "get", node, "gain", "--spin-time", "1", **peer)
+    assert result.returncode == 2 and f"node {node} does not exist or has no parameters; nodes that have: " in result.stderr
+    assert node not in result.stderr.partition("nodes that have: ")[2]
 
 
 def test_services(run):

@@ -44,19 +44,19 @@ def answer(command: int, payload: bytes, direction: bytes = b">") -> bytes:
 
 # -- MSP -------------------------------------------------------------------------------------------------------------
 
-@given(payloads=st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=60)), max_size=5),
+@given(payloads=st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=60), st.booleans()), max_size=5),
        noise=st.lists(st.binary(max_size=9), min_size=5, max_size=5),
        cuts=st.lists(st.integers(1, 40), min_size=1, max_size=20))
 @settings(max_examples=100, deadline=None)
 def test_frames_are_found_in_whatever_pieces_and_between_noise(payloads, noise, cuts):
     noise = [piece.replace(b"$", b"#") for piece in noise]
-    stream = b"".join(piece + answer(*frame) for piece, frame in zip(noise, payloads))
+    stream = b"".join(piece + answer(command, payload, b"!" if refused else b">") for piece, (command, payload, refused) in zip(noise, payloads))
     parser, found, at = msp.Parser(), [], 0
     while at < len(stream):
         size = cuts[at % len(cuts)]
         found += parser.feed(stream[at:at + size])
         at += size
-    assert [(frame.command, frame.payload) for frame in found] == payloads and parser.checksum_errors == 0
+    assert [(frame.command, frame.payload, frame.refused) for frame in found] == payloads and parser.checksum_errors == 0
 
 
 def test_a_torn_frame_is_counted_and_the_next_one_is_found():
@@ -106,8 +106,8 @@ def test_reasons_not_to_arm_that_last_are_those_of_repairs_settings_and_restarts
 
 def test_short_and_refused_answers_are_typed_errors():
     for read in (msp.status, msp.battery, msp.attitude, lambda frame: msp.inertial(frame, 512.0)):
-        for frame in (msp.Frame(1, b"\x01", False), msp.Frame(1, bytes(40), True)):
-            with pytest.raises(msp.MspError):
+        for frame, words in ((msp.Frame(1, b"\x01", False), "^MSP 1: 1 bytes, needs "), (msp.Frame(1, bytes(40), True), "^MSP 1: refused$")):
+            with pytest.raises(msp.MspError, match=words):
                 read(frame)
 
 
@@ -123,6 +123,13 @@ def test_the_rate_curve_is_inverted(centre, more, expo, share):
     curve = RateCurve(centre, centre + more, expo)
     wanted = share * curve.rate(1.0)
     assert curve.rate(curve.stick(wanted)) == pytest.approx(wanted, abs=0.003 * (centre + 6 * more) + 1e-6)
+
+
+@given(centre=st.floats(10, 1500), more=st.floats(0, 1000), expo=st.floats(0, 1), stick=st.floats(-1, 1))
+def test_the_rate_curve_is_that_of_the_firmware(centre, more, expo, stick):
+    """As `applyActualRates` of Betaflight 4.6 computes it: expof = |s| (s^5 e + s (1 - e)), rate = s c + max(0, m - c) expof."""
+    expof = abs(stick) * (np.power(stick, 5) * expo + stick * (1.0 - expo))
+    assert RateCurve(centre, centre + more, expo).rate(stick) == pytest.approx(stick * centre + max(0.0, more) * expof, abs=1e-9 * centre)
 
 
 def test_sticks_have_the_directions_of_a_pilot():
@@ -325,6 +332,17 @@ def test_kill_ends_with_a_command_with_the_motors_off_when_the_autopilot_has_bee
     assert not obeyed(node, False)
     polled(node, 3.0, 50)
     assert node._link.told[-1] == (False, CENTRED) and obeyed(node, True)
+
+
+def test_kill_is_sent_again_with_each_report_that_has_the_autopilot_armed(flown_on, monkeypatch):
+    """Its frame may be lost, and no command follows that would repeat it."""
+    node = flown_on(16.0)
+    monkeypatch.setattr(StubAutopilot, "armed", True)
+    assert polled(node, 1.0, 100, 9.81) == []
+    node.on_command(ControllerCommand(0, Command.KILL, "by hand"))
+    node._link.told.clear()
+    polled(node, 2.0, 100)
+    assert node._link.told.count("kill") >= 3 and set(node._link.told) == {"kill"}
 
 
 @pytest.mark.parametrize("armed", [False, True])
@@ -669,6 +687,7 @@ def test_far_from_level_rates_are_commanded_while_the_attitude_is_fresh_and_self
 def test_what_is_set_otherwise_is_named():
     wanted = ("feature AIRMODE", "set p_roll = 180", "aux 0 0 0 1700 2100 0 0")
     assert differences(wanted, ["feature AIRMODE", "set p_roll = 180", "aux 0 0 0 1700 2100 0 0", "set other = 1"]) == []
+    assert differences(wanted, ["feature AIRMODE", "aux 0 0 0 1700 2100 0 0"]) == ["p_roll is unknown, not 180"]
     assert differences(wanted, ["feature AIRMODE", "set p_roll = 45"]) == ["p_roll is 45, not 180", "aux 0 0 0 1700 2100 0 0 is missing"]
 
 
@@ -704,6 +723,32 @@ def test_a_dump_is_read_to_its_end_in_whatever_pieces_it_arrives(size):
     cli = Cli(lambda data: pending.extend(dump * data.startswith(b"dump")), receive)
     cli.check(Configuration("mine.txt", ("set p_roll = 180",)))
     assert not pending
+
+
+@pytest.mark.parametrize("words", ["", "###ERROR IN set: VALUE OUT OF RANGE###", "INVALID NAME", "Unknown command, try 'help'"])
+def test_a_line_that_the_firmware_refuses_ends_the_configuration_before_it_is_saved(words):
+    sent, pending = [], bytearray()
+
+    def send(data: bytes) -> None:
+        sent.append(data)
+        refused = words if data.startswith(b"set b") else ""
+        pending.extend(data + f"\r\n{refused}\r\n# ".encode())
+
+    def receive(_: float) -> bytes:
+        piece = bytes(pending)
+        pending.clear()
+        return piece
+
+    cli, mine = Cli(send, receive), Configuration("mine.txt", ("set a = 1", "set b = 9999", "set c = 2"))
+    if words:
+        with pytest.raises(CliError, match="^mine.txt: set b = 9999: the firmware refuses it: ") as error:
+            cli.apply(mine)
+        assert words.strip("#") in str(error.value)
+    else:
+        cli.apply(mine)
+    cli.leave()
+    assert sent[1:] == ([b"set a = 1\r\n", b"set b = 9999\r\n", b"exit\r\n"] if words else
+                        [*(line.encode() + b"\r\n" for line in mine.lines), b"save\r\n"])
 
 
 def test_a_firmware_in_the_loop_that_ends_is_named_at_once():

@@ -17,7 +17,7 @@ from contextlib import suppress
 
 import pytest
 from perch_autopilot import msp
-from perch_autopilot.supervised_link import COMMAND, LinkSupervisor, SupervisedLink
+from perch_autopilot.supervised_link import COMMAND, THROTTLES, LinkSupervisor, SupervisedLink
 from perch_autopilot.rate_curve import RateCurve
 from perch_autopilot.watchdog import OFF, ON, Watchdog
 from perch_autopilot.link import Link, LinkError, PortTaken
@@ -156,6 +156,91 @@ def test_a_supervisor_tells_its_mode_again_when_a_lost_link_is_back():
             peer.close()
         assert said == ["following", "the link to the autopilot has ended", "following"]
         supervisor._link.close()
+
+
+class Supervised:
+    """A supervisor of this process in a time of its own, with the node's and the autopilot's end of its sockets."""
+
+    def __init__(self) -> None:
+        self.now, self.parser = 0.0, msp.Parser()
+        self.node, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.autopilot, ours = socket.socketpair()
+        self.autopilot.setblocking(False)
+        self.supervisor = LinkSupervisor(f"fd:{ours.detach()}", theirs, Watchdog(1450, 1420, curves=CURVES), lambda: self.now)
+
+    def told(self, *packets: bytes) -> None:
+        """Give it packets of the node."""
+        for packet in packets:
+            self.node.send(packet)
+            self.supervisor.work(0.0)
+
+    def frames(self, seconds: float, attitude: tuple[int, int, int] | None = None) -> list[tuple[float, msp.Frame]]:
+        """What leaves for the autopilot in a time, with the moments; requests of its attitude are answered, unless it is None [0.1, 0.1, 1 deg]."""
+        sent, end = [], self.now + seconds
+        while self.now < end - 1e-9:
+            self.now += 0.001
+            self.supervisor.work(0.0)
+            with suppress(BlockingIOError):
+                sent += [(self.now, frame) for frame in self.parser.feed(self.autopilot.recv(4096).replace(b"$M<", b"$M>"))]
+                if attitude is not None and sent[-1][1].command == msp.ATTITUDE:
+                    self.autopilot.send(msp.request(msp.ATTITUDE, struct.pack("<3h", *attitude)).replace(b"$M<", b"$M>"))
+        return sent
+
+    def channels(self, seconds: float, **options) -> list[tuple[int, ...]]:
+        """Channels that leave in a time [us]."""
+        return [struct.unpack("<6H", frame.payload) for _, frame in self.frames(seconds, **options) if frame.command == msp.SET_RAW_RC]
+
+
+@pytest.fixture
+def supervised() -> Iterator[Supervised]:
+    one = Supervised()
+    yield one
+    for end in (one.node, one.autopilot, one.supervisor._control, one.supervisor._link):
+        if end is not None:
+            end.close()
+
+
+def test_frames_leave_at_200_hz_from_the_first_command_on_whatever_the_rate_of_the_commands(supervised):
+    assert supervised.frames(0.5) == []
+    supervised.told(b"C" + COMMAND.pack(True, *STICKS))
+    moments = [moment for moment, frame in supervised.frames(1.0) if frame.command == msp.SET_RAW_RC]
+    assert len(moments) == pytest.approx(200, abs=1) and max(b - a for a, b in zip(moments, moments[1:])) < 0.0061
+
+
+def test_the_supervisor_does_what_the_node_says(supervised):
+    """Throttles of another battery, motors that turn already, KILL, and requests that are passed on."""
+    supervised.told(b"T", b"C" + COMMAND.pack(True, *STICKS))
+    assert set(supervised.channels(0.01)) == {(*STICKS, ON, OFF)}, "motors that turn do not wait for the time of arming"
+    supervised.told(b"H" + THROTTLES.pack(1470, 1430), b"R" + msp.request(msp.ANALOG))
+    assert msp.ANALOG in {frame.command for _, frame in supervised.frames(0.01)}
+    assert supervised.channels(0.1)[-1] == (1500, 1500, 1470, 1500, ON, ON)
+    assert supervised.channels(0.6)[-1] == (1500, 1500, 1430, 1500, ON, ON)
+    supervised.told(b"C" + COMMAND.pack(True, *STICKS))
+    assert supervised.channels(0.01)[-1][4] == ON
+    supervised.told(b"K")
+    assert {channels[4] for channels in supervised.channels(0.1)} == {OFF}
+
+
+def test_far_from_level_the_supervisor_asks_for_the_attitude_and_levels_by_rates(supervised):
+    supervised.told(b"T", b"C" + COMMAND.pack(True, *STICKS))
+    assert {frame.command for _, frame in supervised.frames(0.015)} == {msp.SET_RAW_RC}
+    roll, *rest = supervised.channels(0.1, attitude=(800, 0, 0))[-1]
+    assert roll < 1500 and rest == [1500, 1450, 1500, ON, OFF], "it lies on its right side: roll to the left"
+    assert supervised.channels(0.1)[-1] == (1500, 1500, 1450, 1500, ON, ON), "its attitude is old: by its own mode"
+
+
+def test_a_supervisor_waits_a_minute_for_a_lost_link_and_not_for_ever(supervised):
+    supervised.told(b"C" + COMMAND.pack(True, *STICKS))
+    supervised.frames(0.1)
+    supervised.supervisor._address = "/dev/no_such_device"
+    supervised.autopilot.close()
+    supervised.node.close()
+    ended = []
+    while not ended and supervised.now < 200.0:
+        supervised.now += 0.01
+        supervised.supervisor.work(0.0)
+        ended += [supervised.now] * (supervised.supervisor._final_frames >= 10)
+    assert 64.0 < ended[0] < 65.0, "a minute after the descent of 4 s has ended"
 
 
 def test_a_process_for_the_link_that_cannot_be_started_is_one_line(monkeypatch):

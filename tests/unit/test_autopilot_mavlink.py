@@ -165,6 +165,19 @@ def test_the_clock_of_the_shortest_way_counts_and_a_jump_is_followed():
     assert clock.offset == pytest.approx(-800 * SECOND, abs=1e6)
 
 
+def test_an_exchange_of_long_ago_gives_way_to_slower_ones_as_clocks_drift():
+    """By 50 ppm, 3 ms in a minute: an offset that only the fastest of all exchanges sets would be wrong by more and more."""
+    clock = ClockOffset()
+    clock.answered(0, 500_000, 1_000_000)                      # the fastest one, 1 ms there and back
+    assert clock.offset == 0
+    for k in range(1, 600):
+        sent = k * SECOND
+        drift = 50e-6 * sent
+        clock.answered(sent, round(sent + 3_000_000 + drift), sent + 6_000_000)
+        assert abs(clock.offset + drift) <= 5_000_000          # within the time after which an exchange has aged from 1 to 6 ms: 91 s
+    assert clock.offset < -25_000_000
+
+
 # -- byte streams ----------------------------------------------------------------------------------------------------
 
 class Autopilot:

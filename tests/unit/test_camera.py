@@ -155,7 +155,7 @@ def test_points_behind_the_camera_are_never_projected(camera):
     pixels, valid = camera.project(points)
     assert not valid.any()
     assert np.isnan(pixels).all()
-    assert np.isnan(camera.project_jacobian(points)).any(axis=(-1, -2)).all()
+    assert np.isnan(camera.project_jacobian(points)).all()
 
 
 def test_wide_lens_stops_before_its_polynomial_turns_over():

@@ -42,6 +42,33 @@ def test_another_source_or_flag_is_another_library(cache: Path) -> None:
     assert {path.suffix for path in cache.iterdir()} == {".so"}  # nothing temporary is left
 
 
+def test_another_compiler_or_processor_is_another_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cache may be on a disk that machines share, and outlives an update of the compiler."""
+    paths, (program, version) = [compiled.library("test", SOURCE % 5)], compiled.compiler()
+    for name, other in (("compiler", (program, f"{version} of another day")), ("_processor", "flags : another")):
+        with monkeypatch.context() as patched:
+            patched.setattr(compiled, name, lambda other=other: other)
+            paths.append(compiled.library("test", SOURCE % 5))
+    with monkeypatch.context() as patched:
+        patched.setattr(compiled.platform, "machine", lambda: "another")
+        paths.append(compiled.library("test", SOURCE % 5))
+    assert len(set(paths)) == 4 and compiled.library("test", SOURCE % 5) == paths[0]
+
+
+def test_a_library_is_never_there_in_part(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process would load it: it is complete when it gets its name, also where another one was faster."""
+    compiled.library("test", SOURCE % 6)
+    [product], seen, replace = cache.iterdir(), [], compiled.os.replace
+    product.unlink()
+
+    def watched(source: str, target: Path) -> None:
+        seen.append((target.exists(), answer(Path(source))))
+        replace(source, target)
+
+    monkeypatch.setattr(compiled.os, "replace", watched)
+    assert compiled.library("test", SOURCE % 6) == product and seen == [(False, 6)]
+
+
 def test_two_processes_at_once_get_the_same_library(cache: Path) -> None:
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         first, second = pool.starmap(compiled.library, [("test", SOURCE % 7)] * 2)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pytest
 
 from perch_core import config
-from perch_core.config import choice, derived, part, quantity, text
+from perch_core.config import choice, derived, label, part, quantity, text
 from perch_core.errors import ConfigError
 
 
@@ -61,6 +61,29 @@ def test_refusals_name_file_key_and_range(tmp_path, content, key, words):
         read(tmp_path, content)
     assert error.value.key == key
     assert words in str(error.value) and "x.yaml" in str(error.value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Named:
+    title: str = label("none")
+    note: str = text("")
+    limit: float = quantity(0.0, unit="m", low=1.0, high=5.0, doc="0: none")
+
+
+@pytest.mark.parametrize("content, words", [
+    ("{title: ../up}", "is no name"), ("{title: a/b}", "is no name"), ("{title: ''}", "is no name"), ("{title: .hidden}", "is no name"),
+    (f"{{title: {'a' * 101}}}", "is no name"), ("{title: my wall_2.b+c-d}", ""), (f"{{note: {'x' * 2001}}}", "is not text of up to"), ("{note: two lines}", ""),
+    ('{note: "a\\ab"}', "is not text of up to"), ("{limit: 0.5}", "0.5 is outside [1, 5] m"), ("{limit: 0}", ""), ("{limit: 5}", "")])
+def test_names_of_files_texts_and_a_default_that_stands_for_none(tmp_path, content, words):
+    """Folders and topics are called by labels; a value that is the default may be written, though it is outside the range."""
+    path = tmp_path / "x.yaml"
+    path.write_text(content)
+    if words:
+        with pytest.raises(ConfigError) as error:
+            config.load(Named, path)
+        assert words in str(error.value)
+    else:
+        config.load(Named, path)
 
 
 def test_broken_yaml_and_missing_file(tmp_path):

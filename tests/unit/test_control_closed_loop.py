@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from closed_loop.loop import fly_to_contact, make_loop, perch, predictive
 from closed_loop.plant import EstimationError
+from perch_control import actuation
 from perch_control.admission import AtEnd, TrajectoryRefused
 from perch_control.l1 import L1Augmentation
+from perch_control.maneuvers import recovered
 from perch_control.modes import State
 from perch_control.parameters import ControllerParameters
 from perch_core.config import from_mapping
@@ -105,6 +108,24 @@ def test_l1_does_not_take_the_impact_for_a_disturbance_in_the_recovery(nearer):
     assert (loop.plant.p - surface) @ plan.normal > 0.24
 
 
+@pytest.mark.parametrize("change, does", [
+    ({}, "update"), ({"planned": 0.3}, "update"), ({"planned": 0.01}, "update"), ({"planned": -0.01}, "hold"), ({"mode": State.LANDING}, "hold"),
+    ({"mode": State.RECOVERING}, "hold"), ({"ground": 1.2, "airborne": False}, "reset"), ({"recovers": True}, "reset")])
+def test_forces_of_ground_and_walls_are_estimated_as_no_disturbance(change, does):
+    """At a contact and in a landing the estimate is kept; on the ground and in a recovery after a blow there is none."""
+    loop, called = make_loop(), []
+    loop.begin_in_hover()
+    flight, x = loop.controller, loop.controller.flight_state
+    compensator = SimpleNamespace(update=lambda *_: called.append("update") or (0.0,) * 6, hold=lambda: called.append("hold") or (0.0,) * 6,
+                                  reset=lambda: called.append("reset"))
+    x = x._replace(mode=change.get("mode", x.mode), ground=change.get("ground", 0.0), airborne=change.get("airborne", True))
+    if "planned" in change:
+        x = x._replace(mode=State.TRACKING, planned_contact=(x.now + change["planned"], x.state_estimate[:3]))
+    x = recovered(x, "for a test") if change.get("recovers") else x
+    actuation.fly(x, x.setpoint(), flight.law, compensator, 0.002)
+    assert called == [does]
+
+
 def test_abort_in_mid_perch_recovers(seed=1):
     plan = perch("surface_90_1.7m")
     loop = make_loop(noise_seed=seed, floor=-10.0)
@@ -162,6 +183,7 @@ def test_a_single_bad_sample_is_bridged():
     loop.odometry = hiccup
     loop.run(1.0)
     assert loop.controller.state is State.HOVERING and np.linalg.norm(loop.plant.v) < 0.02
+    assert 1 <= sum("refused" in text for _, _, text in loop.events) <= 2, "ten are refused: with two publishers every other one would be"
 
 
 def test_jumped_odometry_hovers_at_the_new_place_without_chasing_it():

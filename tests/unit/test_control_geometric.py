@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from oracles import rigid_body
 from perch_control.admission import TrajectoryRefused
 from perch_control.geometric import GeometricController, packed_vehicle
-from perch_control.geometric.controller import CONE_DEG
 from perch_control.geometric.law import attitude_error, geometric_step
 from perch_control.geometric.step import predicted
 from perch_control.reference import FlatReference, SampledReference, Setpoint, packed_many
@@ -138,13 +137,47 @@ def test_singular_cases_stay_finite(a, h, b3):
 
 
 def test_feedback_never_turns_the_thrust_out_of_its_cone():
-    controller = GeometricController(VEHICLE, ControlGains())
+    """Of 40 deg, and below the weight narrower in proportion to the thrust."""
+    controller, shares = GeometricController(VEHICLE, ControlGains()), []
     for seed in range(50):
         rng = np.random.default_rng(seed)
         state = tuple(float(v) for v in (*rng.normal(size=6) * 5, 0, 0, 0, 1, 0, 0, 0))
         out = controller.step(state, Setpoint((0.0, 0.0, 1.0)).packed, RotorEstimate((1260.0,) * 4, (1260.0,) * 4))
-        tilt = np.degrees(np.arccos(Rotation.from_quat(out.q_C).as_matrix()[2, 2]))
-        assert tilt <= CONE_DEG + 1e-6
+        tilt = np.arccos(Rotation.from_quat(out.q_C).as_matrix()[2, 2])
+        shares.append(np.tan(tilt) / (np.tan(np.radians(40.0)) * min(out.wrench[0] / VEHICLE.mass / 9.81, 1.0)))
+    assert max(shares) < 1.0 + 1e-6 and np.sum(np.array(shares) > 1.0 - 1e-6) > 5, "it leans as far as it may"
+
+
+def commanded(state, reference=Setpoint((0.0, 0.0, 1.0)), **options):
+    """What the law commands in an upright, or otherwise given, state: position, velocity and then the rest."""
+    return GeometricController(VEHICLE, ControlGains()).step((*map(float, state),), reference.packed, RotorEstimate((1260.0,) * 4, (1260.0,) * 4), **options)
+
+
+def test_the_position_feedback_is_bounded_by_what_the_vehicle_has_beside_its_weight():
+    """At 100 m below its reference as at 3 m: 8 m/s^2, up or down; and in proportion to a small error."""
+    thrusts = [commanded((0, 0, 1.0 - e, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0)).wrench[0] / VEHICLE.mass - 9.81 for e in (100.0, 3.0, 0.1, 0.2, -3.0)]
+    assert thrusts[0] == pytest.approx(8.0, abs=0.05) == thrusts[1] and thrusts[4] == pytest.approx(-8.0, abs=0.05)
+    assert 0.0 < thrusts[2] < 2.0 and thrusts[3] == pytest.approx(2.0 * thrusts[2], rel=0.1)
+
+
+def test_commanded_rates_and_angular_accelerations_are_bounded():
+    """A reference that turns faster than any plan may, and a snap that no rotor follows."""
+    still = (0, 0, 1.0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0)
+    for jerk in (50.0, 200.0, 2000.0):
+        rate = np.linalg.norm(commanded(still, Setpoint((0.0, 0.0, 1.0), j=(jerk, 0.0, 0.0))).w_C)
+        assert rate == pytest.approx(min(jerk / 9.81, 1.3 * VEHICLE.body_rate_max), rel=1e-3)
+    for snap in (1000.0, 1e5):
+        turn = np.linalg.norm(commanded(still, Setpoint((0.0, 0.0, 1.0), s=(snap, 0.0, 0.0))).dw_C)
+        assert turn == pytest.approx(min(snap / 9.81, 250.0), rel=1e-3)
+
+
+def test_in_the_last_moments_before_a_contact_the_feedback_does_not_turn_the_thrust():
+    """It would tilt the vehicle at the contact, and hardly move it until then; along the thrust it acts as before."""
+    off = (0.0, 2.0, 0.9, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0)
+    outs = [commanded(off, time_to_contact=time) for time in (np.inf, 1.0, 0.35, 0.25, 0.05, 0.0, -0.1)]
+    tilts = [np.degrees(np.arccos(min(Rotation.from_quat(out.q_C).as_matrix()[2, 2], 1.0))) for out in outs]
+    assert tilts[0] == tilts[1] > 30.0 and tilts[1] > tilts[2] > tilts[3] > 0.5 and max(tilts[4:]) < 1e-5
+    assert outs[-1].wrench[0] > VEHICLE.mass * 10.2
 
 
 def test_prediction_agrees_with_the_rigid_body_model():

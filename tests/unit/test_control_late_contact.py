@@ -27,8 +27,12 @@ def touch(name, farther):
     loop = make_loop(settings=params.flight, law=GeometricController(vehicle, params.gain_set))
     loop.begin_in_hover()
     loop.plant.floor = -10.0
+    law, end, left = loop.controller.law, loop.time + 0.04 + plan.trajectory.duration, []
+    control = law.control
+    law.control = lambda *arguments: left.append(arguments[4]) or control(*arguments)
     loop.follow(plan.trajectory, AtEnd.CONTACT)
     assert loop.run(plan.trajectory.duration + 0.3, until=lambda x: (x.plant.p - plan.contact) @ plan.normal <= -farther)
+    assert left[-1] == pytest.approx(max(end - loop.time, 0.0), abs=0.003), "the law knows when the contact is planned"
     v, n = loop.plant.v, plan.normal
     return -v @ n, np.linalg.norm(v - (v @ n) * n), loop.controller.state
 

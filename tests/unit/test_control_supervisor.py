@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from closed_loop.loop import make_loop, perch
 from perch_control import monitors
-from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints
+from perch_control.admission import AtEnd, Order, TrajectoryRefused, check_joints, check_order, check_start
 from perch_control.flight_settings import FlightSettings
 from perch_control.guidance import Blend, Hold, Polynomial, blended, brake, quintic
-from perch_control.maneuvers import following, recovered
+from perch_control.maneuvers import following, hover_after_jump, recovered, stopped
 from perch_control.modes import CommandRefused, State
 from perch_control.odometry_gate import OdometryGate
+from perch_control.recovery import Recovery
 from perch_control.sensor_inputs import SensorInputs
-from perch_control.reference import FlatReference, SampledReference
+from perch_control.reference import FlatReference, SampledReference, Setpoint
 from perch_core import so3
 from perch_core.errors import ConfigError
 from perch_core.trajectory import FlatTrajectory, SampledTrajectory, rest_to_rest
-from perch_core.values import Command
+from perch_core.values import Command, TrajectoryOrder
+from perch_core.vehicle import load_vehicle
 
 REST = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -147,6 +151,26 @@ def test_a_recovery_that_ends_at_the_ground_lands(height, end):
     assert loop.controller.state is end, loop.events
 
 
+@pytest.mark.parametrize("tilt, share", [(85.0, 0.95), (60.0, 0.95), (95.0, 0.25), (180.0, 0.25)])
+def test_a_recovery_turns_with_high_thrust_unless_that_would_push_the_vehicle_down(tilt, share):
+    """19 of 20 m/s^2 brake the fall in the second half of the turn; b3 points down in the first. It leads the vehicle by 50 deg."""
+    half = np.radians(tilt) / 2
+    guidance = Recovery(20.0, moved(REST, q=(0.0, np.sin(half), 0.0, np.cos(half))), None)
+    guidance.update(moved(REST, q=(0.0, np.sin(half), 0.0, np.cos(half))), 1.0)
+    f = np.array(guidance.setpoint(0.0).a) + (0.0, 0.0, 9.81)
+    assert np.linalg.norm(f) == pytest.approx(20.0 * share) and not guidance.finished
+    assert np.degrees(np.arccos(f[2] / (20.0 * share))) == pytest.approx(tilt - 50.0, abs=1e-6)
+
+
+def test_a_brake_that_is_ordered_again_is_still_that_of_a_trajectory_that_was_left_early():
+    """No perch begins in it: by a second abort, or by odometry that jumps, it would be forgotten."""
+    loop, _ = leaving()
+    loop.controller.abort("stop it")
+    x = loop.controller.flight_state
+    assert x.left_early and x.mode is State.HOVERING
+    assert stopped(x, "again").left_early and hover_after_jump(x, "odometry has jumped").left_early
+
+
 @pytest.mark.parametrize("inclination", [0.0, 10.0, 20.0, 60.0])
 def test_a_recovery_leaves_a_surface_of_any_inclination(inclination):
     turn = np.radians(inclination)
@@ -213,6 +237,54 @@ def test_trajectories_that_jump_inside_are_refused():
     bad = good | {"p": good["p"] + np.where(np.arange(11) > 5, 0.3, 0.0)[:, None]}
     with pytest.raises(TrajectoryRefused, match="position jumps"):
         check_joints(SampledTrajectory(**bad))
+
+
+def test_trajectories_whose_velocity_jumps_inside_are_refused():
+    """Positions are continuous: 0.5 m/s to rest, and 1 to 2 m/s within 10 ms, in which the hardest flight gains 0.6 m/s."""
+    c = np.zeros((2, 4, 2))
+    c[:, 0], c[:, 2] = ((0.0, 1.0), (1.0, 1.0)), 1.2
+    with pytest.raises(TrajectoryRefused, match="velocity jumps by 0.500 m/s at 2.000 s"):
+        check_joints(FlatTrajectory(np.array([2.0, 1.0]), c))
+    times = np.linspace(0.0, 1.0, 101)
+    for begin, end, jumps in ((1.0, 2.0, True), (1.0, 1.7, False)):
+        v = np.outer(np.where(times > 0.5, end, begin), (1.0, 0.0, 0.0))
+        p = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (v[1:] + v[:-1]) * 0.01, axis=0)])
+        samples = SampledTrajectory(times, p, np.tile((0, 0, 0, 1.0), (101, 1)), v, np.zeros((101, 3)), np.zeros((101, 3)), np.zeros((101, 3)),
+                                    np.full((101, 4), 0.6))
+        if jumps:
+            with pytest.raises(TrajectoryRefused, match="velocity jumps by .* at 0.510 s"):
+                check_joints(samples)
+        else:
+            check_joints(samples)
+
+
+@pytest.mark.parametrize("place, velocity, start, why", [
+    ((0.3, 0.0, 0.0), (0.0, 0.0, 0.9), 5.0, ""), ((0.0, 0.36, 0.0), (0.0,) * 3, 5.0, "starts 0.36 m away from the vehicle"),
+    ((0.0,) * 3, (0.0, 1.1, 0.0), 5.0, "starts 1.10 m/s from the vehicle's velocity"), ((0.0,) * 3, (0.0,) * 3, 4.6, ""),
+    ((0.0,) * 3, (0.0,) * 3, 4.4, "starts 0.60 s in the past"), ((0.0,) * 3, (0.0,) * 3, 66.0, "starts 61.00 s in the future")])
+def test_a_trajectory_begins_where_and_when_the_vehicle_is_and_as_fast(place, velocity, start, why):
+    """A step of the velocity that feedback has to make up for is as bad as one of the place."""
+    at_rest = FlatReference(FlatTrajectory(np.array([2.0]), np.zeros((1, 4, 2))))
+    present = Setpoint(place, velocity)
+    if why:
+        with pytest.raises(TrajectoryRefused, match=why):
+            check_start(Order(1, at_rest, start), 5.0, present)
+    else:
+        check_start(Order(1, at_rest, start), 5.0, present)
+
+
+@pytest.mark.parametrize("duration, x, why", [
+    (0.2, (0.0, 19.0), ""), (0.2, (0.0, 21.0), "velocity of 105 is beyond 100"), (0.05, (0.0, 0.0, 1.2), ""),
+    (0.05, (0.0, 0.0, 1.3), "acceleration of 1040 is beyond 1000")])
+def test_polynomials_with_derivatives_that_no_vehicle_flies_are_refused(duration, x, why):
+    c = np.zeros((1, 4, len(x)))
+    c[0, 0] = x
+    order = TrajectoryOrder.of(1, FlatTrajectory(np.array([duration]), c))
+    if why:
+        with pytest.raises(TrajectoryRefused, match=why):
+            check_order(order, load_vehicle("snapdragon"))
+    else:
+        check_order(order, load_vehicle("snapdragon"))
 
 
 def test_sampled_trajectory_is_flown():
@@ -283,6 +355,18 @@ def test_brake_meets_state_and_rest():
     np.testing.assert_allclose((*y.v, *y.a), 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("v, within, duration, peak", [
+    ((0.2, 0.0, 0.0), np.inf, 0.4, 0.94), ((2.0, 0.0, 0.0), np.inf, 0.94, 4.0), ((3.0, -4.0, 0.0), np.inf, 2.34, 4.0), ((0.0, 0.0, -3.0), np.inf, 1.41, 4.0),
+    ((3.0, -4.0, 0.0), 1.5, 1.5, 6.25), ((3.0, -4.0, 0.0), 0.1, 1.17, 8.0), ((0.0, 0.0, -3.0), 0.1, 0.70, 8.0), ((2.0, 0.0, 0.0), 3.0, 0.94, 4.0)])
+def test_a_brake_leans_by_22_degrees_in_the_open_and_by_more_only_where_there_is_no_room(v, within, duration, peak):
+    """4 m/s^2; before a surface 8 m/s^2 at most, and then it takes longer than there is time. Velocity falls all the way."""
+    b = brake((0.0, 0.0, 5.0), v, (0.0, 0.0, 0.0), (0, 1, 0), within=within)
+    motion = [b.setpoint(float(t)) for t in np.linspace(0.0, b.duration, 201)]
+    assert b.duration == pytest.approx(duration, abs=0.01) and max(np.linalg.norm(x.a) for x in motion) == pytest.approx(peak, rel=0.01)
+    assert (np.diff([np.linalg.norm(x.v) for x in motion]) < 1e-9).all()
+    np.testing.assert_allclose(np.subtract(motion[-1].p, motion[0].p), 0.5 * b.duration * np.array(v), atol=1e-9)
+
+
 @pytest.mark.parametrize("fault, expected, word", [
     ("fence", State.HOVERING, "geofence"), ("far", State.LANDING, "outside the geofence"), ("tilt", State.RECOVERING, "tilt"),
     ("rate", State.RECOVERING, "body rate"), ("error", State.RECOVERING, "away from the reference"),
@@ -320,6 +404,34 @@ def test_each_fault_leads_to_its_answer(fault, expected, word, monkeypatch):
     assert reached, (loop.controller.state, flight.flight_state.message, loop.events)
 
 
+@pytest.mark.parametrize("p, outside", [
+    ((-1.5, 0.0, 0.0), 0.5), ((2.25, 0.0, 0.0), 0.25), ((0.0, -3.5, 0.0), 0.5), ((0.0, 4.75, 0.0), 0.75), ((0.0, 0.0, -5.125), 0.125),
+    ((0.0, 0.0, 7.0), 1.0), ((-1.5, 6.0, 5.0), 2.0), ((-1.0, 4.0, 6.0), 0.0), ((1.9, -2.9, -4.9), 0.0)])
+def test_every_side_of_the_geofence_counts(p, outside):
+    fence = FlightSettings(fence_low=(-1.0, -3.0, -5.0), fence_high=(2.0, 4.0, 6.0))
+    assert monitors.TrackingMonitor(fence, 8.0).outside(p) == outside
+
+
+def test_a_recovery_that_does_not_come_to_rest_descends_after_six_seconds():
+    """Odometry that shows a vehicle which never slows down: it cannot recover by it for ever."""
+    loop = hovering()
+    x = recovered(loop.controller.flight_state, "for a test")
+    x = x._replace(state_estimate=(*x.state_estimate[:3], 3.0, 0.0, 0.0, *x.state_estimate[6:]))
+    supervisor = loop.controller.supervisor
+    assert supervisor.act(x._replace(now=x.now + 5.9), False).mode is State.RECOVERING
+    after = supervisor.act(x._replace(now=x.now + 6.1), False)
+    assert after.mode is State.LANDING and after.message == "landing: the recovery did not come to rest"
+
+
+@pytest.mark.parametrize("at_end, mode, message", [(AtEnd.LAND, State.LANDING, "landing after trajectory 3"),
+                                                   (AtEnd.HOLD, State.HOVERING, "hovering at the end of trajectory 3")])
+def test_a_trajectory_ends_as_its_order_says(at_end, mode, message):
+    loop = hovering()
+    loop.follow(rest_to_rest(loop.plant.p, loop.plant.p, 0, 0, 0.2), at_end, id=3)
+    loop.run(0.26)
+    assert (loop.controller.state, loop.controller.flight_state.message) == (mode, message)
+
+
 def test_a_geofence_without_an_inside_is_refused():
     with pytest.raises(ConfigError, match="fence_low.*is not below fence_high"):
         FlightSettings(fence_low=(-20.0, -20.0, 20.0))
@@ -334,7 +446,25 @@ def test_at_rest_and_tilted_stops_the_motors_whatever_odometry_says(tilt):
         loop.controller.step(loop.time + 0.002 * k, loop.plant.state)
         if loop.controller.state is State.FAILED:
             break
-    assert 0.002 * k < 1.5
+    assert 0.1 < 0.002 * k < 1.5, "a blow is shorter"
+
+
+@pytest.mark.parametrize("tilt, share, rate, pause, stops", [
+    (70.0, 1.0, 0.0, 0.0, True), (135.0, 1.1, 0.0, 0.0, True), (180.0, 0.9, 0.4, 0.0, True), (50.0, 1.0, 0.0, 0.0, False), (70.0, 1.25, 0.0, 0.0, False),
+    (70.0, 0.75, 0.0, 0.0, False), (70.0, 1.0, 0.6, 0.0, False), (70.0, 1.0, 0.0, 0.15, False)],
+    ids=["wall", "overhang", "upside down", "leaning", "pulled up", "falling", "turning", "interrupted"])
+def test_what_carries_a_tilted_vehicle_for_a_second_is_not_its_rotors(tilt, share, rate, pause, stops):
+    """By the IMU alone, where the rotors' health and odometry tell nothing."""
+    loop, angle, now = hovering(), np.radians(tilt), 0.0
+    x, supervisor = loop.controller.flight_state, loop.controller.supervisor
+    force, level = (share * 9.81 * np.sin(angle), 0.0, share * 9.81 * np.cos(angle)), (0.0, 0.0, 9.81)
+    for _ in range(700):
+        now += 0.002
+        x = supervisor.imu(x, 100.0 + now, (0.0, rate, 0.0), level if 0.6 < now < 0.6 + pause else force)
+        if x.mode is State.FAILED:
+            break
+    assert (x.mode is State.FAILED) is stops
+    assert not stops or (1.0 < now < 1.2 and "at rest and tilted with the motors running" in x.message)
 
 
 def test_a_descent_without_any_sensor_ends():
@@ -369,6 +499,17 @@ def leaving(recovery_start: float = 1.6):
 def ready(loop, start: float, planned: float, id: int = 7) -> None:
     order = along_x(planned, 0.4 * (planned - start), 0.4, 0.8, brakes=True)
     loop.controller.keep_ready(Order(id, SampledReference(order, loop.controller.vehicle.mass), planned, AtEnd.HOLD, 0.0, 0.0))
+
+
+def test_a_way_out_that_jumps_inside_is_not_kept():
+    loop, start = leaving()
+    path = along_x(start + 0.6, 0.24, 0.4, 0.8, brakes=True)
+    torn = replace(path, p=path.p + np.where(path.times > 0.4, 0.3, 0.0)[:, None])
+    with pytest.raises(TrajectoryRefused, match="position jumps by 0.5"):
+        loop.controller.keep_ready(Order(7, SampledReference(torn, loop.controller.vehicle.mass), start + 0.6))
+    loop.run(0.1)
+    loop.controller.abort("stop it")
+    assert loop.controller.state is State.HOVERING, "there is no way out"
 
 
 def test_an_abort_does_not_leave_by_a_recovery_that_begins_elsewhere():

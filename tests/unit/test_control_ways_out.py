@@ -9,6 +9,7 @@ from closed_loop.loop import make_loop, perch
 from closed_loop.plant import Disturbances
 from perch_control.admission import AtEnd, TrajectoryRefused
 from perch_control.descent import BlindDescent
+from perch_control.flight_settings import FlightSettings
 from perch_control.modes import State
 from perch_core.trajectory import rest_to_rest
 from perch_core.vehicle import ControlGains, load_vehicle
@@ -66,7 +67,13 @@ def test_a_velocity_that_cannot_be_is_not_braked():
     assert descent((2.0, 0.0, 0.0)).wrench()[2] < 0.0, "moving along +x, the vehicle leans back"
 
 
-def test_lost_vio_does_not_brake_into_the_wall():
+def test_a_descent_brakes_a_climb_and_a_fast_fall_and_lets_a_slow_one_go_on():
+    thrust = {climb: descent((0.0, 0.0, climb)).wrench()[0] for climb in (2.0, 0.5, 0.0, -0.5, -1.0, -3.0)}
+    weight = load_vehicle("snapdragon").mass * 9.81
+    assert thrust[2.0] < thrust[0.5] < thrust[0.0] == thrust[-0.5] < weight < thrust[-1.0] < thrust[-3.0]
+
+
+def test_neither_lost_vio_nor_the_geofence_brakes_into_the_wall():
     plan = perch("surface_90_1.7m")
 
     def flown(before):
@@ -74,11 +81,15 @@ def test_lost_vio_does_not_brake_into_the_wall():
         loop.begin_in_hover()
         loop.follow(plan.trajectory, AtEnd.CONTACT, id=2)
         loop.run(0.04 + plan.trajectory.duration - before)
-        loop.controller.estimator(2, 1.5, "")
-        return loop.controller.state
+        flight, (x, _, _) = loop.controller, loop.plant.p
+        flight.use(flight.law, flight.gains, FlightSettings(fence_high=(x - 0.1, 20.0, 20.0)))
+        at_fence = flight.supervisor.act(flight.flight_state, False).mode
+        flight.use(flight.law, flight.gains, FlightSettings())
+        flight.estimator(2, 1.5, "")
+        return at_fence, flight.state
 
-    assert flown(0.4) is State.TRACKING, "no brake ends before the wall"
-    assert flown(1.4) is State.HOVERING, "there is room to brake"
+    assert flown(0.4) == (State.TRACKING,) * 2, "no brake ends before the wall"
+    assert flown(1.4) == (State.HOVERING,) * 2, "there is room to brake"
 
 
 @pytest.mark.parametrize("share, flies", [(0.6, False), (1.0, True)])

@@ -13,6 +13,7 @@ from perch_control.admission import AtEnd, Order, TrajectoryRefused
 from perch_control.modes import State
 from perch_control.reference import FlatReference
 from perch_control.rotor_health import RotorHealth
+from perch_control.thrust_model import ThrustModel
 from perch_control.weak_landing import WeakLanding
 from perch_core.trajectory import FlatTrajectory, rest_to_rest
 from perch_core.vehicle import GRAVITY, load_vehicle
@@ -51,6 +52,43 @@ def test_little_thrust_says_nothing():
     for k in range(500):
         assert not x.update(0.0, 0.4 * GRAVITY, 0.002 * k)
     assert x.ratio == 1.0
+
+
+@pytest.mark.parametrize("milliseconds, weak", [(17, False), (60, True)])
+def test_a_shock_is_not_taken_for_weak_rotors(milliseconds, weak):
+    """Without any thrust for 13 ms, the ratio is below 77 %; it has to stay there for 20 ms."""
+    x = health()
+    for k in range(500):
+        x.update(0.0 if 100 <= k < 100 + milliseconds // 2 else 30.0 if k == 100 + milliseconds // 2 else 10.0, 10.0, 0.002 * k)
+    assert x.weak is weak
+
+
+def test_what_is_measured_changes_the_model_within_what_rotors_can_be():
+    """From what just carries the weight to 1.1 of the file's thrust, in steps of 2 %."""
+    for share, applied, plausible in ((1.3, 1.1, 1.3), (2.0, 1.1, 1.5), (0.85, 0.85, 0.85), (0.2, 1.001 / 1.83, 1.001 / 1.83)):
+        x = health()
+        for k in range(3000):
+            x.update(share * 10.0, 10.0, 0.002 * k)
+        x.adopt()
+        assert (x.applied_ratio, x.plausible_mean) == pytest.approx((applied, plausible), abs=0.02)
+
+
+@pytest.mark.parametrize("change, weak", [
+    ({}, True), ({"rate": 9.0}, True), ({"rate": 11.0}, False), ({"ground": 1.2, "airborne": False}, False), ({"contact": 0.1}, False),
+    ({"contact": 0.2}, True), ({"stale": True}, False)],
+    ids=["hover", "turning", "spinning", "on the ground", "at the contact", "before the contact", "no IMU"])
+def test_where_something_else_acts_the_accelerometer_says_nothing_of_the_rotors(change, weak):
+    loop = make_loop()
+    loop.begin_in_hover()
+    flight, x = loop.controller, loop.controller.flight_state
+    model = ThrustModel(flight.vehicle)
+    model.measured_specific_thrust = 5.0
+    state = (*x.state_estimate[:10], 0.0, 0.0, change.get("rate", 0.0))
+    x = x._replace(state_estimate=state, ground=change.get("ground", 0.0), airborne=change.get("airborne", True))
+    for k in range(200):
+        contact = (x.now + 0.002 + change["contact"], state[:3]) if "contact" in change else None
+        x = model.updated(x._replace(now=x.now + 0.002, planned_contact=contact), flight.law, None, not change.get("stale", False))
+    assert model.health.weak is x.weak is weak
 
 
 @pytest.mark.parametrize("disturbances", [
@@ -184,6 +222,10 @@ def test_height_comes_before_braking():
     assert abs(falling[0]) < 0.5 and falling[2] == pytest.approx(1.05 * GRAVITY, rel=1e-3), "a fast fall takes all thrust"
     gently = demand((2.0, 0, -1.8), 0.5, 1.05 * GRAVITY, tilt_deg=20.0)
     assert np.degrees(np.arctan2(gently[0], gently[2])) == pytest.approx(20.0 - np.degrees(0.08), abs=0.1)
+
+
+def test_a_weak_landing_keeps_thrust_for_the_moments_while_it_still_climbs():
+    assert demand((0.0, 0.0, 3.0), 1.0, 1.3 * GRAVITY)[2] == pytest.approx(0.6 * GRAVITY)
 
 
 @pytest.mark.parametrize("seed, repeated", [(11, False), (20, True)])

@@ -208,6 +208,16 @@ def test_measurements_of_another_time_are_refused(shift):
     hover.fly(0.2).assert_running()
 
 
+def test_of_measurements_that_come_while_the_imu_is_silent_the_newest_twenty_wait():
+    """They fill no memory, and the filter begins with the oldest of those."""
+    hover = Hover(vio=None).fly(0.1)
+    for k in range(25):
+        hover.tell(odometry(hover.now, p=(0.1 * k, 0.0, 1.0)))
+    hover.fly(0.01)
+    assert any("vio/odometry: more than 20 values without an IMU sample" in text for text in hover.out.warnings())
+    hover.assert_running((0.5, 0.0, 1.0))
+
+
 def test_odometry_that_is_ignored_is_not_converted(monkeypatch):
     hover = Hover(vio=None).fly(0.1)
     hover.tell(state(hover.now))

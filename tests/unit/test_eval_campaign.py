@@ -45,8 +45,9 @@ def test_draws_follow_their_distributions():
     normal = [parse_distribution("c", "a", {"normal": [1.0, 0.1]}).draw(rng) for _ in range(2000)]
     assert kstest(uniform, "uniform", (2.0, 3.0)).pvalue > 0.01
     assert kstest(normal, "norm", (1.0, 0.1)).pvalue > 0.01
-    limited = [parse_distribution("c", "a", {"normal": [1.0, 0.1], "low": 0.95, "high": 1.2}).draw(rng) for _ in range(500)]
+    limited = [parse_distribution("c", "a", {"normal": [1.0, 0.1], "low": 0.95, "high": 1.2}).draw(rng) for _ in range(2000)]
     assert min(limited) >= 0.95 and max(limited) <= 1.2
+    assert kstest(limited, "truncnorm", (-0.5, 2.0, 1.0, 0.1)).pvalue > 0.01  # drawn again, not cut off: no value is more frequent
     assert {parse_distribution("c", "a", {"choice": [1, 2, 3]}).draw(rng) for _ in range(100)} == {1, 2, 3}
 
 

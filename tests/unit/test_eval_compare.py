@@ -12,6 +12,7 @@ from unit.recorded_flights import flown, record
 
 from perch_core.vehicle import load_vehicle
 from perch_eval import comparison, plots
+from perch_eval.flight import Flight
 from perch_eval.flight_view import FlightView
 from perch_eval.margins import margin_text, limits, margins
 from perch_eval.ros.recorded_flight import RecordedFlight
@@ -31,6 +32,17 @@ def test_margins_are_distances_to_the_limits_of_vehicle_and_material(recorded):
     strict = replace(scenario, adhesion=replace(scenario.adhesion, tangential_speed_max=0.08))
     assert [one["name"] for one in margins(flight, vehicle, strict) if one["left"] < 0.0] == ["tangential speed at contact"]
     assert "contact" not in "".join(one["name"] for one in margins(flight, vehicle))
+
+
+def test_margins_at_a_cable_are_those_of_the_gripper():
+    """Limits of 0.1 m, 0.3 m/s in all, 10 deg; the contact is 3 cm off, with 0.16 and 0.12 m/s, tilted by 0.02 rad."""
+    scenario = load_scenario("line_180")
+    scenario = replace(scenario, grip=replace(scenario.grip, position=0.1, speed=0.3, tilt_deg=10.0))
+    channels = flown()
+    channels["contact"][-1:] = [(3.4, channels["contact"][-1][1]._replace(body="cable 0", normal_speed=0.16, tangential_speed=0.12))]
+    found = {one["name"]: one["left"] for one in margins(Flight(channels), load_vehicle("snapdragon"), scenario)}
+    assert {name: left for name, left in found.items() if "contact" in name} == pytest.approx({
+        "distance of the cable at contact": 0.07, "tilt error at contact": 10.0 - math.degrees(0.02), "speed at contact": 0.1})
 
 
 def test_limits_are_words_also_after_json():

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageSequence
 from unit.recorded_flights import BIAS, PATH, flown, record
 
+from perch_core import so3
 from perch_core.urdf import urdf
-from perch_core.values import (
-    AtEnd, TrajectoryOrder)
+from perch_core.values import NANOSECONDS, AtEnd, ImuSample, OdometryState, RatesThrust, TrajectoryOrder, rotated
 from perch_core.vehicle import load_vehicle
 from perch_eval import comparison, plots, report
 from perch_eval.camera_clip import clip
@@ -54,8 +54,44 @@ def test_figures_are_what_was_put_in(recorded):
     assert found["estimation_rmse_m"] == pytest.approx(np.abs(BIAS), abs=1e-9) and found["velocity_rmse_m_s"] == pytest.approx([0.0] * 3, abs=1e-9)
     assert found["tracking_rmse_m"] == pytest.approx([0.0] * 3, abs=1e-9) and found["target_error"] == pytest.approx({"position_m": 0.04, "attitude_deg": 0.0})
     assert found["max_body_rate_deg_s"] == pytest.approx(math.degrees(0.5))
+    planned = np.linalg.norm([PATH.sample(t).a for t in np.linspace(0.0, 1.9, 500)], axis=1).max()
+    assert found["max_acceleration_m_s2"] == pytest.approx(planned, rel=0.01)
     assert (found["contact"]["state"], found["contact"]["body"], found["contact"]["normal_speed_m_s"]) == ("attached", "pad", 0.7)
     assert rates(flight)["odometry"] == pytest.approx(500.0) and rates(flight)["rotor_state"] == pytest.approx(100.0)
+
+
+def test_errors_that_were_put_in_are_found_each_under_its_name():
+    """A reference 2 and 3 cm beside the path, an estimate turned by 2 deg and 0.1 m/s too fast, a pad turned by 3 deg."""
+    channels, turn = flown(), so3.quat_exp(np.radians([0.0, 0.0, 2.0]))
+
+    def estimated(state):
+        q = so3.quat_multiply(turn, np.array(state.q_WB))
+        v_W = np.add(rotated(state.q_WB, state.v_B, 1.0), (0.1, 0.0, -0.05))
+        return state._replace(q_WB=tuple(q.tolist()), v_B=rotated(tuple(q.tolist()), tuple(v_W.tolist()), -1.0))
+
+    channels["odometry"] = [(t, estimated(state)) for t, state in channels["odometry"]]
+    channels["controller/reference"] = [(t, x._replace(p=tuple(np.add(x.p, (0.02, 0.0, -0.03)).tolist()))) for t, x in channels["controller/reference"]]
+    [(t, pad)] = channels["target/pose"]
+    channels["target/pose"] = [(t, pad._replace(q_WS=so3.quat_multiply(so3.quat_exp(np.radians([0.0, 0.0, 3.0])), pad.q_WS)))]
+    found = flight_metrics(Flight(channels), 4.0)
+    assert found["tracking_rmse_m"] == pytest.approx([0.02, 0.0, 0.03], abs=1e-9)
+    assert found["velocity_rmse_m_s"] == pytest.approx([0.1, 0.0, 0.05], abs=1e-6)
+    assert found["attitude_error_at_end_deg"] == pytest.approx(2.0, abs=1e-6) and found["estimation_error_at_end_m"] == pytest.approx(BIAS, abs=1e-9)
+    assert found["target_error"] == pytest.approx({"position_m": 0.04, "attitude_deg": 3.0}, abs=1e-6)
+
+
+@pytest.mark.parametrize("channel", ["motor_command", "rates_thrust_command"])
+def test_thrusts_that_are_commanded_and_reached_are_those_of_rotors_or_autopilot(channel):
+    """k Omega^2 of four rotors at 1200 rad/s, or the mass times 9 m/s^2; no thrust while commands have the motors off."""
+    channels, vehicle = flown(), load_vehicle("snapdragon")
+    given = {"motor_command": channels["motor_command"], "rates_thrust_command": timed(
+        RatesThrust(command.stamp, True, (0.0,) * 3, 9.0) for _, command in channels["motor_command"])}[channel]
+    del channels["motor_command"]
+    channels[channel] = [(t, command._replace(armed=t < 3.0)) for t, command in given]
+    t, thrust, commanded = thrust_history(Flight(channels), vehicle)
+    expected = {"motor_command": 4.0 * vehicle.thrust_coefficient * 1200.0**2, "rates_thrust_command": 9.0 * vehicle.mass}[channel]
+    assert len(t) == 300 and thrust == pytest.approx(2.4)
+    assert commanded[t < 2.99] == pytest.approx(expected) and not commanded[t > 3.0].any()
 
 
 def test_rotors_that_are_reported_only_while_they_stand_are_no_thrust_in_flight():
@@ -103,6 +139,23 @@ def test_any_change_of_a_hashed_value_changes_the_hash_and_what_comes_later_does
     assert Flight(channels).digest(3.0) == before
     channels["odometry"] = [(t, s._replace(p_WB=(*s.p_WB[:2], s.p_WB[2] + 1e-12)) if 2.0 < t < 2.003 else s) for t, s in channels["odometry"]]
     assert Flight(channels).digest(3.0) != before
+
+
+@pytest.mark.parametrize("channel, change", [
+    ("ground_truth/odometry", lambda x: x._replace(w_B=(*x.w_B[:2], x.w_B[2] + 1e-12))), ("odometry", lambda x: x._replace(q_WB=(1e-12, *x.q_WB[1:]))),
+    ("odometry", lambda x: x._replace(pose_covariance=x.pose_covariance + 1e-12)), ("odometry", lambda x: x._replace(stamp=x.stamp + 1000)),
+    ("imu/data_raw", lambda x: x._replace(f_B=(*x.f_B[:2], x.f_B[2] + 1e-9))), ("vio/odometry", lambda x: x._replace(v_B=(1e-12, 0.0, 0.0))),
+    ("target/pose", lambda x: x._replace(p_WS=x.p_WS + 1e-12)), ("motor_command", lambda x: x._replace(armed=False)),
+    ("trajectory", lambda x: x._replace(trajectory=replace(x.trajectory, coefficients=x.trajectory.coefficients + 1e-12))),
+    ("trajectory", lambda x: x._replace(at_end=AtEnd.RECOVER)), ("controller/reference", lambda x: x._replace(a=(1e-12, 0.0, 0.0)))])
+def test_one_number_of_one_state_command_or_estimate_changes_the_hash(recorded, channel, change):
+    channels = {name: recorded[1].values(name)[:20] for name in recorded[1].topics}
+    still = OdometryState(2 * NANOSECONDS, (0.0,) * 3, (0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, np.eye(6), np.eye(6))
+    channels |= {"imu/data_raw": timed([ImuSample(2 * NANOSECONDS, (0.0,) * 3, (0.0, 0.0, 9.81))]), "vio/odometry": timed([still])}
+    before = Flight(channels).digest(4.0)
+    (t, first), *rest = channels[channel]
+    assert Flight(channels | {channel: [(t, change(first)), *rest]}).digest(4.0) != before
+    assert Flight(channels | {channel: rest}).digest(4.0) != before == Flight(channels).digest(4.0)
 
 
 def test_a_report_is_written(recorded, reported):
@@ -176,6 +229,16 @@ def test_an_animation_has_a_frame_for_each_moment_and_plots_are_written(recorded
     with Image.open(gif) as image:
         assert image.n_frames == 4
     assert {"tracking.png", "path.png", "rates.png", "thrust.png"} <= {p.name for p in (tmp_path / "plots").iterdir()}
+
+
+@pytest.mark.parametrize("speed, times", [("1", [1.2, 1.3, 1.4, 1.5]), ("0.5", [1.2, 1.25, 1.3, 1.35, 1.4, 1.45, 1.5, 1.55]), ("2", [1.2, 1.4])])
+def test_slow_motion_shows_more_moments_of_the_same_time(recorded, tmp_path, monkeypatch, speed, times):
+    drawn = []
+    monkeypatch.setattr(command, "Scene", lambda *_: None)
+    monkeypatch.setattr(command, "write_animation", lambda scene, times, fps, file: drawn.append((times, fps)) or file.touch())
+    assert main([str(recorded[0]), "--from", "1.2", "--to", "1.6", "--fps", "10", "--speed", speed, "--out", str(tmp_path / "f.gif")]) == 0
+    [(shown, fps)] = drawn
+    assert fps == 10.0 and shown == pytest.approx(np.array(times))
 
 
 def test_an_animation_of_a_vehicle_without_front_camera_shows_the_images_of_the_other_one(recorded):

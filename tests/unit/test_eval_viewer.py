@@ -178,7 +178,7 @@ def test_whoever_comes_late_gets_all_fixed_frames(show):
     assert "<robot" in topics.decode("robot_description", show.client.of("/robot_description")[0][1])
 
 
-def test_fast_topics_are_thinned_and_images_are_packed_while_somebody_looks(show):
+def test_fast_topics_are_thinned_and_images_are_packed_while_somebody_looks_also_where_time_begins_anew(show):
     client, topic = show.client, "/camera_front/image_raw/compressed"
     pixels, looked = np.zeros((48, 64, 3), np.uint8), []
     pixels[:, :32] = (200, 30, 30)
@@ -201,6 +201,9 @@ def test_fast_topics_are_thinned_and_images_are_packed_while_somebody_looks(show
     assert image.shape == (48, 64, 3) and image[24, 10, 2] > 150 > image[24, 10, 0]  # red, in BGR
     times = [t for t, _ in client.of("/odometry")]
     assert np.diff(times).min() >= 10_000_000 and np.diff([t for t, _ in client.of(topic)]).min() >= 50_000_000
+    show.step = 50
+    show.until(lambda: all(np.diff(stamps).min() < 0 for stamps in ([t for t, _ in client.of("/odometry")], [t for t, _ in client.of(topic)],
+                                                                    [scene.stamp for scene in show.drawn])), "the flight that began anew", fly)
 
 
 def test_mapped_cables_come_and_go():
@@ -225,6 +228,9 @@ def test_what_cannot_be_drawn_is_warned_of_and_passed_on(show):
     show.handlers["trajectory"](Serialized("/trajectory", 0, serialize_message(empty), type(empty)))
     assert [line.level for line in said] == ["warning"] and "trajectory is not drawn" in said[0].text
     show.until(lambda: "/trajectory" in show.client.channels, "the topic")
+    show.client.subscribe("/trajectory")
+    show.until(lambda: show.client.of("/trajectory"), "the trajectory")
+    assert deserialize_message(show.client.of("/trajectory")[0][1], Trajectory) == empty
 
 
 def test_a_port_in_use_is_refused_with_what_to_do(served):

@@ -70,8 +70,13 @@ def test_a_loop_is_asked_for_what_the_rotors_would_do(delay, gain):
 def test_commands_keep_to_the_loops_limits():
     estimate = rotors_at_rest(VEHICLE).turning(HOVER).following((VEHICLE.speed_max, VEHICLE.speed_min) * 2, (0.0,) * 9 + (1.0, 40.0, -40.0, 0.0),
                                                          VEHICLE)
-    assert np.abs(estimate.sent.w_B).max() <= VEHICLE.actuation.rate_max
-    assert 0.0 <= estimate.sent.thrust <= 4 * VEHICLE.thrust_max / VEHICLE.mass
+    assert estimate.sent.w_B[:2] == (VEHICLE.actuation.rate_max, -VEHICLE.actuation.rate_max), "which such a turn takes in full"
+    assert 0.0 < abs(estimate.sent.w_B[2]) < VEHICLE.actuation.rate_max
+    assert 0.0 < estimate.sent.thrust < 4 * VEHICLE.thrust_max / VEHICLE.mass
+    slow = replace(VEHICLE, actuation=replace(VEHICLE.actuation, thrust_lag=0.5))  # whose thrust has to be asked for far beyond itself
+    for speed, thrust in ((VEHICLE.speed_max, 4 * VEHICLE.thrust_max / VEHICLE.mass), (VEHICLE.speed_min, 0.0)):
+        estimate = rotors_at_rest(slow).turning(HOVER).following((speed,) * 4, (0.0,) * 9 + (1.0, 0.0, 0.0, 0.0), slow)
+        assert estimate.sent.thrust == pytest.approx(thrust)
 
 
 @settings(max_examples=50)

@@ -10,7 +10,7 @@ from perch_core import so3
 from perch_perception.line_mapping import (
     LineDetectionConfig, LineMapper, MapperConfig, TriangulationConfig, WireCurve, WireEstimate, detect_lines, place)
 from perch_perception.line_mapping.association import meets_another
-from perch_perception.line_mapping.mapper import PIECE_IDS
+from perch_perception.line_mapping.mapper import PIECE_IDS, _same_wire
 from perch_perception.pose_buffer import BodyState, PoseBuffer, StampError
 from perch_perception.powerline_mapper import mapping_pose
 from perch_sim.rendering import CableCurve, Renderer, Scene
@@ -108,6 +108,49 @@ def whole(segments):
         ends = np.concatenate([np.array(segment.ends), out.get(number % 100, np.zeros((0, 3)))])
         out[number % 100] = ends[[np.argmin(ends[:, 1]), np.argmax(ends[:, 1])]]
     return out
+
+
+ACROSS = WireCurve(np.array([3.0, 0.0, 2.2]), np.array([0.0, 1.0, 0.0]))
+
+
+def mapped(spans, wire=ACROSS, begin=1.6, step=0.1, attitude=1e-3, stop=100):
+    """The map after a climb up to image `stop`, in each image of which a span of the wire is seen; `attitude`: 1 sigma of the vehicle's [rad]."""
+    rng, mapper = np.random.default_rng(17), LineMapper(MapperConfig())
+    for k, span in enumerate(spans):
+        centre = np.array([0.0, 0.0, begin + step * min(k, stop)])
+        body = BodyState(0.1 * k, centre, np.array([0, 0, 0, 1.0]), np.zeros(3), np.zeros(3), np.diag([1e-6] * 3 + [attitude**2] * 3))
+        result = mapper.update(body.time, body, [observe(rng, wire, centre, 1e-4, span, time=body.time)])
+    return result
+
+
+NEAR = WireCurve(np.array([0.5, 0.0, 2.0]), np.array([0.0, 1.0, 0.0]))
+
+
+@pytest.mark.parametrize("spans, more, extent", [
+    (10 * [(-1.0, 1.0)] + [(-1.0, 1.8), (-1.0, 1.5), (-1.9, 1.0)], {}, (-1.0, 1.5)),
+    (7 * [(-2.0, 2.0), (-2.0, 8.5)], {}, (-2.0, 2.0)),
+    (6 * [(-1.0, 1.0), (-1.0, 5.0)], dict(wire=NEAR, begin=1.85, step=0.03), (-1.0, 1.0)),
+    (10 * [(-2.0, 2.0)] + [(-1.5, 2.5), (-1.0, 3.0), (-0.5, 3.5)], dict(stop=9), (-2.0, 3.0))],
+    ids=["seen twice", "within 8 m", "not almost along it", "by a turn in one place"])
+def test_a_wire_is_as_long_as_it_was_seen_for_sure(spans, more, extent):
+    (line,) = mapped(spans, **more).lines
+    assert sorted((line.start[1], line.end[1])) == pytest.approx(extent, abs=0.03)
+
+
+@pytest.mark.parametrize("attitude, published", [(0.04, True), (0.06, False)])
+def test_a_wire_that_is_known_to_worse_than_15_cm_is_named_and_not_published(attitude, published):
+    """3 m away, by what the vehicle's attitude is doubted by."""
+    result = mapped(12 * [(-1.0, 1.0)], attitude=attitude)
+    assert (len(result.lines) == 1) is published is not result.degenerate
+    assert published or result.message == f"line 0: position uncertainty of {3.05 * attitude:.2f} m is too large"
+
+
+@pytest.mark.parametrize("turn_deg, aside, same", [(2.0, 0.04, True), (4.0, 0.0, False), (0.0, 0.07, False)])
+def test_two_wires_are_one_where_they_run_together_and_not_where_they_cross(turn_deg, aside, same):
+    """The second one was seen over half a metre: however it is turned, it is near the first one there."""
+    one, other = (SimpleNamespace(estimate=WireEstimate(wire, 1e-6 * np.eye(5), np.ones(4, bool), np.zeros(3), 0.01), extent=(-0.25, 0.25)) for wire in (
+        ACROSS, WireCurve(ACROSS.point + [0.0, 0.0, aside], so3.exp(np.radians([0.0, 0.0, turn_deg])) @ ACROSS.direction)))
+    assert _same_wire(one, other) is same
 
 
 def test_motion_along_the_wires_is_called_degenerate(wires):
@@ -295,6 +338,15 @@ def test_a_jump_is_a_correction_at_any_speed_but_not_across_a_pause(step, interv
         time = 1.002 + interval + later
         poses.add(BodyState(time, velocity * time + jump, level, velocity, np.zeros(3), np.eye(6) * 1e-6))
         np.testing.assert_allclose(poses.at(time).corrected, counted * jump, atol=1e-12)
+
+
+@pytest.mark.parametrize("speed, interval, share", [(0.9, 0.02, 0.0), (1.5, 0.02, 0.5), (2.5, 0.02, 1.0), (2.5, 0.06, 0.0)])
+def test_a_small_correction_counts_the_more_the_faster_it_flies_and_not_across_a_gap(speed, interval, share):
+    """By 8 cm, less than what is a jump."""
+    poses, level, velocity = PoseBuffer(), np.array([0.0, 0.0, 0.0, 1.0]), np.array([speed, 0.0, 0.0])
+    for time, correction in ((1.0, 0.0), (1.0 + interval, 0.08)):
+        poses.add(BodyState(time, velocity * time + (0.0, correction, 0.0), level, velocity, np.zeros(3), np.eye(6) * 1e-6))
+    np.testing.assert_allclose(poses.at(poses.newest).corrected, [0.0, 0.08 * share, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("rate, steps", [(500, [0.016] * 25), (150, [0.13] * 3), (30, [0.4 * 0.4 * 0.6**n for n in range(9)]),

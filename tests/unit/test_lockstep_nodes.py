@@ -23,7 +23,7 @@ from perch_msgs.action import Perch  # noqa: E402
 from perch_msgs.srv import PlanPerch  # noqa: E402
 from perch_sim.lockstep.link import ParticipantListener, address, connect_to_vehicle, pack, unpack  # noqa: E402
 from perch_sim.ros.participant_node import ParticipantNode  # noqa: E402
-from perch_sim.ros.vehicle_node import RealTimeVehicleNode, VehicleNode  # noqa: E402
+from perch_sim.ros.vehicle_node import BURST, RealTimeVehicleNode, VehicleNode  # noqa: E402
 from perch_sim.simulated_vehicle import SimulatedVehicle  # noqa: E402
 from perch_sim.vehicle_node import NODE  # noqa: E402
 from rclpy.action import ActionClient  # noqa: E402
@@ -232,7 +232,7 @@ def test_a_burst_does_not_look_for_messages_again_right_after_it_has_received_so
     monkeypatch.setattr(made, "_receive", lambda timeout: looks.append(timeout > 0.0) or timeout > 0.0)
     monkeypatch.setattr(made, "_advance_queued", True)
     made._burst()
-    assert looks == [False, True] * (len(looks) // 2)
+    assert looks == [False, True] * (BURST // 2)
 
 
 def test_a_participant_without_a_vehicle_says_so(executor, monkeypatch):

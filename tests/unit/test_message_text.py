@@ -108,7 +108,7 @@ def test_numbers_that_yaml_takes_for_text_are_numbers():
 
 def test_types_by_name():
     assert interface("std_msgs/msg/String", "msg") is interface("std_msgs/String", "msg") is String
-    for name in ("std_msgs", "std_msgs/msg/Strin", "no_msgs/msg/A", "std_srvs/srv/Trigger", "./msg/String"):
+    for name in ("std_msgs", "std_msgs/msg/Strin", "no_msgs/msg/A", "std_srvs/srv/Trigger", "./msg/String", "std_msgs/msg/_string"):
         with pytest.raises(GraphError, match="type "):
             interface(name, "msg")
 

@@ -498,8 +498,14 @@ def test_a_landing_out_of_a_recovery_ends_the_goal_with_what_the_controller_says
 
 def test_recovery_without_end_is_bounded():
     world = World(sticks=False, recovers=False)
-    world.run()
-    assert world.outcome is not None and world.time < 60.0
+    world.machine.start(Goal(takeoff_height=1.2, search_timeout=6.0), world.time)
+    while world.machine.phase is not Phase.RECOVERING:
+        world.tick()
+    world.hover_at, began, limit = math.inf, world.time, world.machine.settings.phase_timeout
+    while world.outcome is None:
+        world.tick()
+    assert world.outcome.result is Result.TRACKING_LOST and f"no hover within {limit:g} s (says so)" in world.outcome.message
+    assert world.commands[-1] is Command.LAND and limit < world.time - began < limit + 0.1
 
 
 def test_adhesion_needs_place_attitude_speed_and_force():

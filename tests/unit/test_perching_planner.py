@@ -29,6 +29,7 @@ from perch_planner.problem import PerchSettings, StartState
 from perch_planner.verifier import Requirements, verify
 from unit.planner_asker import Asked
 
+ROOT = Path(__file__).resolve().parents[2]
 WALL = PerchSurface.from_inclination(np.array([1.7, 0.0, 1.4]), math.radians(90.0))
 
 
@@ -61,6 +62,8 @@ def test_the_error_codes_are_those_of_the_service() -> None:
     from perch_msgs.srv import PlanPerch
 
     assert all(getattr(PlanPerch.Response, code.name) == code for code in PerchPlanError)
+    answer = (ROOT / "src" / "perch_msgs" / "srv" / "PlanPerch.srv").read_text().partition("---\n")[2]
+    assert {name: int(code) for name, code in re.findall(r"^uint8 (\w+)=(\d+)", answer, re.MULTILINE)} == {code.name: code for code in PerchPlanError}
 
 
 def test_a_plan_comes_as_polynomials_with_certificates(ask: Asked) -> None:

@@ -44,6 +44,7 @@ def test_the_script_writes_samples_coefficients_and_a_picture(tmp_path):
     done = call_script("plan.py", "surface_90", "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert "the independent verifier finds nothing broken" in done.stdout
+    assert done.stdout.splitlines()[-1] == "written: " + ", ".join(str(tmp_path / name) for name in ("plan.csv", "plan.json", "plan.png"))
     written = json.loads((tmp_path / "plan.json").read_text())
     assert all(c["holds"] for c in written["certificates"])
     with (tmp_path / "plan.csv").open() as file:

@@ -207,36 +207,44 @@ def test_a_first_guess_that_is_far_off_costs_no_plan(seed, guess):
 
 
 def test_certificates_enclose_what_dense_sampling_finds():
-    planned = checked(PerchProblem(StartState(HOVER.p, yaw=0.6), surface(90.0)), PerchSettings(contact_delay=0.03))
+    target, settings = surface(90.0), PerchSettings(contact_delay=0.03)
+    planned = checked(PerchProblem(StartState(HOVER.p, yaw=0.6), target), settings)
     proofs = {c.quantity: c for c in planned.certificates}
     at = planned.trajectory.sample_many(np.linspace(0.0, planned.duration, 4001))
     states = [flat_to_state(*row, VEHICLE.mass) for row in zip(at.p, at.v, at.a, at.j, at.s, at.yaw, at.yaw_rate, at.yaw_acc)]
     thrust = np.array([s.thrust for s in states])
     rate = np.array([np.linalg.norm(s.w_WB_B) for s in states])
-    for values, name, slack in ((thrust, "thrust", 1e-3), (at.p[:, 2], "height", 2e-3), (rate, "body_rate", 0.15)):
+    speed = np.linalg.norm(at.v, axis=1)
+    for values, name, slack in ((thrust, "thrust", 1e-3), (speed, "speed", 1e-3), (at.p[:, 2], "height", 2e-3), (rate, "body_rate", 0.15)):
         proof = proofs[name]
         assert proof.minimum <= values.min() + 1e-9 and values.max() <= proof.maximum + 1e-9
         assert proof.maximum <= values.max() * (1 + slack) + 1e-3
+    force = at.a + (0.0, 0.0, GRAVITY)
+    lean = np.linalg.norm(np.cross(force, target.normal), axis=1) / np.linalg.norm(force, axis=1)
+    rim = (at.p - target.p_WS) @ target.normal - Limits.of(settings, VEHICLE).extension * lean
+    assert rim.min() - 5e-3 <= proofs["clearance"].minimum <= rim.min() + 1e-9
     assert at.p[thrust.argmax(), 2] == pytest.approx(planned.trajectory.sample(proofs["thrust"].time_of_maximum).p[2], abs=0.05)
 
 
-@pytest.mark.parametrize("problem, settings, code", [
-    (PerchProblem(HOVER, surface(90.0)), {"impact_acceleration": 30.0}, refusals.UNREACHABLE_TILT),
-    (PerchProblem(HOVER, surface(90.0)), {"impact_acceleration": 1.0}, refusals.UNREACHABLE_TILT),
-    (PerchProblem(HOVER, surface(90.0)), {"thrust_max": 2.3}, refusals.THRUST_FLOOR),
-    (PerchProblem(HOVER, surface(90.0), segment_times=(0.5,)), {"thrust_max": 2.6, "duration_max": 8.0}, refusals.THRUST_FLOOR),
-    (PerchProblem(HOVER, surface(90.0)), {"body_rate_max": 1.0, "duration_max": 6.0}, refusals.BODY_RATE),
-    (PerchProblem(HOVER, surface(90.0, p=(-1.0, 0.0, 1.5))), {}, refusals.BOX),
-    (PerchProblem(StartState((0.0, 0.0, 0.05)), surface(90.0)), {}, refusals.BOX),
-    (PerchProblem(StartState((0.0, 0.0, 1.5), a=(0.0, 0.0, -9.0)), surface(90.0)), {}, refusals.BAD_INPUT),
-    (PerchProblem(StartState((0.0, 0.0, 1.5), a=(0.0, 6.0, -9.81)), surface(90.0)), {}, refusals.BAD_INPUT),  # thrust along b2_des
+@pytest.mark.parametrize("problem, settings, code, constraint, margin", [  # of thrusts from 0.506 to 4.046 N, and 2.4525 N of a hover
+    (PerchProblem(HOVER, surface(90.0)), {"impact_acceleration": 30.0}, refusals.UNREACHABLE_TILT, "thrust at contact m alpha", 4.046 - 7.5),
+    (PerchProblem(HOVER, surface(90.0)), {"impact_acceleration": 1.0}, refusals.UNREACHABLE_TILT, "thrust at contact m alpha", 0.25 - 0.506),
+    (PerchProblem(HOVER, surface(90.0)), {"thrust_max": 2.3}, refusals.THRUST_FLOOR, "hover thrust m g", 2.3 - 1.02 * 2.4525),
+    (PerchProblem(HOVER, surface(90.0), segment_times=(0.5,)), {"thrust_max": 2.6, "duration_max": 8.0}, refusals.THRUST_FLOOR, "thrust range", "thrust_max"),
+    (PerchProblem(HOVER, surface(90.0)), {"body_rate_max": 1.0, "duration_max": 6.0}, refusals.BODY_RATE, "body-rate limit", "body_rate_max"),
+    (PerchProblem(HOVER, surface(90.0, p=(-1.0, 0.0, 1.5))), {}, refusals.BOX, "clearance of the start", -1.0 - 0.15),
+    (PerchProblem(StartState((0.0, 0.0, 0.05)), surface(90.0)), {}, refusals.BOX, "height of the start", 0.05 - 0.15),
+    (PerchProblem(StartState((0.0, 0.0, 1.5), a=(0.0, 0.0, -9.0)), surface(90.0)), {}, refusals.BAD_INPUT, "thrust of the start state", 0.2025 - 0.506),
+    (PerchProblem(StartState((0.0, 0.0, 1.5), a=(0.0, 6.0, -9.81)), surface(90.0)), {}, refusals.BAD_INPUT, "heading of the start state", 0.0),  # b2_des
 ])
-def test_refusals_name_the_constraint_and_its_margin(problem, settings, code):
+def test_refusals_name_the_constraint_and_its_margin(problem, settings, code, constraint, margin):
+    """Of a search, `margin` names the limit: what it lacks to the least value with which there is a plan."""
     with pytest.raises(PerchRefusal) as caught:
         plan(problem, PerchSettings(**settings), VEHICLE)
     assert caught.value.code == code
     assert caught.value.margin < 0.0
-    assert caught.value.constraint and str(caught.value)
+    assert caught.value.margin == pytest.approx(settings[margin] - caught.value.relaxed[margin] if isinstance(margin, str) else margin, abs=2e-3)
+    assert caught.value.constraint.startswith(constraint) and str(caught.value)
 
 
 def test_rotors_of_a_plan_that_breaks_another_limit_are_not_called_proved():

@@ -13,6 +13,7 @@ from perch_planner.planner import plan
 from perch_planner.problem import Limits, PerchProblem, PerchSettings, StartState
 from perch_planner.rotor_proof import prove_rotors
 from perch_planner.rotor_thrusts import bases_at, headings, motion, rotor_model, thrusts_along
+from random_perches import shipped_settings
 
 VEHICLE = load_vehicle("snapdragon")
 ROTORS = rotor_model(VEHICLE)
@@ -104,9 +105,11 @@ def test_a_plan_through_free_fall_is_not_proved(planned):
     assert not prove_rotors(falling, yaw, durations, 0.5, 0.5, -10.0, 10.0, *ROTORS)[0]
 
 
-def test_limits_of_the_shipped_planner_are_those_that_are_proved():
-    low, high = Limits.of(PerchSettings(), VEHICLE).rotor_thrust
+def test_limits_of_the_shipped_planner_are_those_that_are_proved(planned):
+    _, certificate, *_ = planned
+    low, high = Limits.of(shipped_settings(), VEHICLE).rotor_thrust
     assert VEHICLE.thrust_min <= low < high <= VEHICLE.thrust_max
+    assert (certificate.lower_limit, certificate.upper_limit) == (low, high) and certificate.method == "interval"
 
 
 def test_the_proof_does_not_depend_on_the_origin():

@@ -28,6 +28,7 @@ from perch_planner.powerline.settings import Margins, PowerlineSettings
 from perch_planner.powerline_planner import PowerlinePlannerComponent, PowerlinePlannerParameters
 from unit.planner_asker import Asked
 
+ROOT = Path(__file__).resolve().parents[2]
 LINES = problem.load("powerline_line_80").segments()
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 DOWN = LINES[0].centre - [0.0, 0.0, 0.175]
@@ -70,6 +71,8 @@ def test_the_error_codes_are_those_of_the_service() -> None:
     from perch_msgs.srv import PlanPowerline
 
     assert all(getattr(PlanPowerline.Response, code.name) == code for code in PowerlinePlanError)
+    answer = (ROOT / "src" / "perch_msgs" / "srv" / "PlanPowerline.srv").read_text().partition("---\n")[2]
+    assert {name: int(code) for name, code in re.findall(r"^uint8 (\w+)=(\d+)", answer, re.MULTILINE)} == {code.name: code for code in PowerlinePlanError}
 
 
 def test_a_perch_with_recovery_is_one_trajectory_with_certificates(ask: Asked) -> None:

@@ -203,6 +203,7 @@ def test_services_and_action(nodes):
 
 
 def test_nodes_and_executables(nodes):
+    assert [name for row in TABLES["node"] for name in code(row[0])] == list(nodes), "each once"
     for row in TABLES["node"]:
         package, executable = code(row[1])[0].split()
         assert NODES[executable] == package and code(row[0]) == [executable]

@@ -102,6 +102,17 @@ def test_the_page_is_that_of_its_figures(bench):
     assert page.partition(bench.INTRODUCTION)[2] == (folder / "README.md").read_text().rstrip("\n").partition(bench.INTRODUCTION)[2]
 
 
-def test_a_folder_that_does_not_exist_does_not_replace_the_page(bench, tmp_path, capsys):
-    assert bench.main([str(tmp_path / "typo"), "--out", str(tmp_path / "out")]) == 2
-    assert "typo: is no folder" in capsys.readouterr().err and not (tmp_path / "out").exists()
+def test_a_recording_that_is_missing_keeps_its_figures_of_the_same_code(bench, monkeypatch, tmp_path, capsys):
+    written = json.loads((ROOT / "docs" / "results" / "recordings" / "results.json").read_text())
+    monkeypatch.setattr(bench, "code_version", lambda: {"commit": "1234567", "digest": "0123456789ab"})
+    (tmp_path / "results.json").write_text(json.dumps(written | {"digest": "0123456789ab"}))
+    assert bench.main([str(tmp_path), "--only", "nasa", "--out", str(tmp_path)]) == 0
+    assert "nasa: " in (said := capsys.readouterr().out) and "is missing: git clone https://github.com/AprilRobotics/apriltag" in said
+    assert json.loads((tmp_path / "results.json").read_text())["recordings"] == written["recordings"]
+
+
+@pytest.mark.parametrize("words", [("typo",), ("typo", "--only", "floor"), (".",)])
+def test_a_folder_without_recordings_does_not_replace_the_page(bench, monkeypatch, tmp_path, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    assert bench.main([*words, "--out", "out"]) == 2
+    assert f"FOLDER: {words[0]}: is no folder with recordings; --help shows how" in capsys.readouterr().err and not Path("out").exists()

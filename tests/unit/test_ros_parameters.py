@@ -106,10 +106,12 @@ def test_types_ranges_units_and_what_is_fixed_are_described(graph):
 
 
 @pytest.mark.parametrize("name, value, words", [
-    ("gain", 11.0, "10"), ("gain", 0.0, "gain"), ("gain", 7.0, "7 shakes the frame"), ("gain", "much", "gain"),
-    ("gain", 8.0, "no law can be built"), ("gain", 9.0, "ZeroDivisionError: a defect"), ("gain", float("nan"), "gain"),
-    ("count", 10, "9"), ("count", 2.5, "count"), ("law", "middling", "'middling' is not one of slow, fast"), ("weights", [1.0, -1.0], "weights"),
-    ("weights", ["heavy"], "weights"), ("vehicle", "snapdragon", "vehicle"), ("no_such_gain", 1.0, "no_such_gain")])
+    ("gain", 11.0, "gain: 11 is outside (0, 10] 1/s"), ("gain", 0.0, "gain: 0 is outside (0, 10] 1/s"), ("gain", 7.0, "gain: 7 shakes the frame"),
+    ("gain", "much", "gain: 'much' is not of type float"), ("gain", 8.0, "no law can be built"), ("gain", 9.0, "ZeroDivisionError: a defect"),
+    ("gain", float("nan"), "gain: nan is outside (0, 10] 1/s"), ("count", 10, "count: 10 is outside [1, 9]"),
+    ("count", 2.5, "count: 2.5 is not of type int"), ("law", "middling", "law: 'middling' is not one of slow, fast"),
+    ("weights", [1.0, -1.0], "weights: -1 is outside [0, 5] kg"), ("weights", ["heavy"], "weights[0]: 'heavy' is not of type float"),
+    ("vehicle", "snapdragon", "read-only parameter: vehicle"), ("no_such_gain", 1.0, "no_such_gain: unknown parameter; allowed: gain, count")])
 def test_a_refused_value_changes_nothing_and_says_why(graph, name, value, words):
     known = name != "no_such_gain"
     before = (graph.describe(name), graph.get(name)) if known else None

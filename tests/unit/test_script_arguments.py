@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
+import importlib
 import importlib.util
 import json
 import os
+import signal
 import subprocess
 import sys
+import tempfile
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -54,6 +58,7 @@ def run(monkeypatch, tmp_path):
 @pytest.mark.parametrize("name, arguments, words", [
     ("start_stack", ("--ready-timeout", "nan"), "--ready-timeout nan is not > 0 s"),
     ("start_stack", ("--ready-timeout", "-1"), "--ready-timeout -1.0 is not > 0 s"),
+    ("fuzz", ("files", "--cases", "file"), "--cases file: cannot be written: Not a directory"),
     ("topic", ("hz", "/imu/data_raw", "--window", "-1"), "-1 is not >= 1"),
     ("topic", ("echo", "/odometry", "-n", "0"), "0 is not >= 1"),
     ("topic", ("pub", "/x", "std_msgs/msg/Empty", "--rate", "0"), "0 is not a number > 0"),
@@ -96,7 +101,6 @@ def run_bench(monkeypatch):
     """Runs `bench.py` with words of a command line; `sim` breaks, the other groups call a function."""
     def run_(figures, *arguments: str) -> int:
         monkeypatch.setattr(bench, "enter", lambda: None)
-        monkeypatch.setattr(bench, "leave_quietly_on_interrupt", lambda: None)
         monkeypatch.setattr("importlib.import_module", lambda name: SimpleNamespace(
             figures=(lambda quick: 1 / 0) if name == "sim" else figures, SEEDS=f"of {name}"))
         monkeypatch.setattr(sys, "path", [*sys.path])
@@ -106,11 +110,12 @@ def run_bench(monkeypatch):
     return run_
 
 
-def test_ctrl_c_in_a_benchmark_that_waits_for_nodes_ends_all_of_them(run_bench):
+def test_ctrl_c_ends_all_benchmarks_and_what_one_of_them_has_started_or_written(run_bench, tmp_path):
     def interrupted(quick):
-        raise KeyboardInterrupt
+        with tempfile.TemporaryDirectory(dir=tmp_path):
+            signal.raise_signal(signal.SIGINT)
 
-    assert run_bench(interrupted) == 130
+    assert run_bench(interrupted) == 130 and not [*tmp_path.iterdir()]
 
 
 def test_a_group_that_breaks_hides_no_figures_and_is_named_in_the_file(run_bench, tmp_path, capsys):
@@ -139,6 +144,14 @@ def test_a_benchmark_whose_file_cannot_be_written_does_not_begin(run_bench, monk
     Path("file").touch()
     assert run_bench(None, "planner", "--json", file) == 2
     assert f"error: --json: {file}: cannot be written: " in capsys.readouterr().err and os.listdir() == ["file"]
+
+
+@pytest.mark.parametrize("script", ["topic", "param", "service", "action"])
+def test_each_sub_command_has_an_example_in_its_help(script):
+    parser = importlib.import_module(script).command_line()
+    verbs = next(action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    for name, command in verbs.items():
+        assert f"python3 scripts/{script}.py {name} " in command.format_help(), name
 
 
 # -- output ----------------------------------------------------------------------------------------------------------

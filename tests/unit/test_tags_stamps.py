@@ -1,5 +1,7 @@
 """Body states at image stamps, and pixels of images."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from perch_core import so3
@@ -41,6 +43,16 @@ def test_a_stamp_without_a_state_is_refused_with_the_reason(stamp, why):
     buffer.add(state(0.2))
     with pytest.raises(StampError, match=why):
         buffer.at(stamp)
+
+
+def test_a_state_whose_covariance_is_none_is_refused_at_its_stamp_and_those_beside_it_are_used():
+    buffer = PoseBuffer()
+    for k in range(4):
+        buffer.add(state(0.02 * k) if k != 1 else replace(state(0.02 * k), covariance=np.diag([1e-4] * 5 + [-1e-4])))
+    for stamp in (0.02, 0.021):
+        with pytest.raises(StampError, match="the odometry's covariance a variance of -"):
+            buffer.at(stamp)
+    assert buffer.at(0.05).p_WB == pytest.approx(0.05 * np.array([2.0, 0.0, -1.0]))
 
 
 def test_refuses_states_that_go_back_or_are_not_finite_and_forgets_old_ones():

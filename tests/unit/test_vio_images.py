@@ -359,7 +359,7 @@ def test_noise_makes_no_features():
 
 
 def test_tracks_stay_on_their_points():
-    """Tracks through the hover against the projection of the floor points they began on: no drift beyond 0.4 px RMS."""
+    """Tracks through the hover against the projection of the floor points they began on: no drift beyond 0.3 px RMS at any time."""
     whole = flight()
     tracker, points, last, errors = Tracker(VioConfig().tracker, whole.mount.camera), {}, None, []
     frames = [f for f in whole.frames if 3.0 < f[0] < 4.2]
@@ -375,9 +375,10 @@ def test_tracks_stay_on_their_points():
         expected, _ = whole.mount.camera.project((np.array([points[features.ids[k]] for k in kept]) - p_WC) @ R_WC)
         errors.append(features.pixels[kept] - expected)
     assert len(errors[-1]) > 0.7 * len(points)
-    # the calibration of the true lens differs by 0.3 %: what all points share is not the tracker's
-    spread = errors[-1] - errors[-1].mean(axis=0)
-    assert np.sqrt((spread**2).mean()) < 0.6
+    # the calibration of the true lens differs by 0.3 %: what all points share is not the tracker's, as far as that reaches
+    shared = np.array([error.mean(axis=0) for error in errors])
+    assert max(np.sqrt(((error - mean) ** 2).sum(axis=1).mean()) for error, mean in zip(errors, shared)) < 0.3
+    assert np.linalg.norm(shared, axis=1).max() < 0.4
 
 
 def test_the_debug_image_shows_the_features():
