@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +18,7 @@ from perch_core.ros.node import connect  # noqa: E402
 from perch_core.ros.wiring import Wiring  # noqa: E402
 from perch_core.values import NANOSECONDS, Command, ControllerCommand, InertialState, MotorCommand, Serialized, Transform  # noqa: E402
 from rclpy.node import Node  # noqa: E402
-from unit.test_requests_of_nodes import until  # noqa: E402
+from unit.test_requests_of_nodes import Nothing, until  # noqa: E402
 
 
 class Listening(Component[None]):
@@ -90,11 +89,6 @@ def test_a_flood_on_one_topic_leaves_time_for_the_others_and_for_other_events():
     events: list[str] = []
     intake.enter(events.append, "stop")
     assert events == ["stop"] and [len(received) for received in taken.values()] == [TAKE_MAX, TAKE_MAX]
-
-
-@dataclass(frozen=True)
-class Nothing:
-    """No parameters."""
 
 
 class Ordering(Component[Nothing]):

@@ -1,7 +1,6 @@
 """Simulation time between nodes of one process."""
 
 import time
-from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -18,12 +17,7 @@ from rclpy.experimental import EventsExecutor  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
-from unit.test_requests_of_nodes import until  # noqa: E402
-
-
-@dataclass(frozen=True)
-class Nothing:
-    """No parameters."""
+from unit.test_requests_of_nodes import Nothing, until  # noqa: E402
 
 
 class Ticking(Component[Nothing]):
